@@ -39,7 +39,7 @@ def look_at(
     fov_y: float = 0.7,
     up: typing.Any = (0.0, 1.0, 0.0),
 ) -> Camera:
-    """A camera at `eye` (3,) that looks at `target` (3,), both in metres; `fov_y` is the vertical field of view, radians.
+    """A camera at `eye` (3,) that looks at `target` (3,), both in metres; `fov_y` is the vertical angle, radians.
 
     Raises ValueError where the eye lies on the target or the view direction is parallel to `up`.
     """
@@ -71,8 +71,8 @@ def orbit(
 ) -> Camera:
     """A batch of cameras on a cylinder about the vertical axis through `target`, all looking at `target`.
 
-    `azimuths` (k,) radians: 0 sees the front of a figure that faces +z, pi/2 sees it from +x. `heights` (k,) or a scalar,
-    metres above the target. UNICA trains its appearance on 50 views of this kind (B.1).
+    `azimuths` (k,) radians: 0 sees the front of a figure that faces +z, pi/2 sees it from +x. `heights` (k,) or a
+    scalar, metres above the target. UNICA trains its appearance on 50 views of this kind (B.1).
     """
     azimuths = np.atleast_1d(np.asarray(azimuths, np.float64))
     heights = np.broadcast_to(np.asarray(heights, np.float64), azimuths.shape)

@@ -47,8 +47,8 @@ def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
 def from_matrix(r: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
     """Unit quaternion with w >= 0 of a rotation matrix.
 
-    All four of Shepperd's candidates are formed and the best conditioned one is taken, so that there is no branch and no
-    division by a small number (Shepperd 1978, "Quaternion from rotation matrix").
+    All four of Shepperd's candidates are formed and the best conditioned one is taken, so that there is no branch and
+    no division by a small number (Shepperd 1978, "Quaternion from rotation matrix").
     """
     m = [[r[..., i, j] for j in range(3)] for i in range(3)]
     candidates = jnp.stack(
