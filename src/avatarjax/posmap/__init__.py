@@ -1,0 +1,32 @@
+"""Position maps: the six-view atlas, encoding and decoding, upscaling, principal components, public files."""
+
+from avatarjax.posmap.atlas import Atlas, Window, build_atlas, windows
+from avatarjax.posmap.codec import (
+    denormalize,
+    encode,
+    from_map,
+    heading,
+    normalize,
+    normalize_group,
+    root,
+    to_map,
+)
+from avatarjax.posmap.upscale import Upscaler, build_upscaler, upscale
+
+__all__ = [
+    "Atlas",
+    "Upscaler",
+    "Window",
+    "build_atlas",
+    "build_upscaler",
+    "denormalize",
+    "encode",
+    "from_map",
+    "heading",
+    "normalize",
+    "normalize_group",
+    "root",
+    "to_map",
+    "upscale",
+    "windows",
+]
