@@ -2,5 +2,6 @@
 
 from avatarjax.cameras import Camera, look_at, orbit
 from avatarjax.gaussians import Gaussians
+from avatarjax.splat import render
 
-__all__ = ["Camera", "Gaussians", "look_at", "orbit"]
+__all__ = ["Camera", "Gaussians", "look_at", "orbit", "render"]

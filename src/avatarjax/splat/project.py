@@ -1,0 +1,116 @@
+"""EWA projection: from 3D Gaussians to 2D Gaussians on the image plane (Zwicker et al. 2001; gsplat's conventions).
+
+Everything is written per component: XLA on CPU is slow at batches of 3x3 products.
+"""
+
+from __future__ import annotations
+
+import typing
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from avatarjax import rotations
+from avatarjax.cameras import Camera
+from avatarjax.gaussians import Gaussians
+from avatarjax.splat.config import SplatConfig
+
+
+class Splats(typing.NamedTuple):
+    """n projected Gaussians; all values of those that are not `valid` are finite and without meaning.
+
+    x, y: centre in pixels. conic_xx, conic_xy, conic_yy: inverse of the 2D covariance, 1/pixel^2. variance_x,
+    variance_y: diagonal of the 2D covariance, pixel^2. depth: metres along the optical axis. valid: finite and in
+    front of the near plane. finite: whether the Gaussian is free of NaN, infinity and overflow.
+    """
+
+    x: Float[Array, " n"]
+    y: Float[Array, " n"]
+    conic_xx: Float[Array, " n"]
+    conic_xy: Float[Array, " n"]
+    conic_yy: Float[Array, " n"]
+    variance_x: Float[Array, " n"]
+    variance_y: Float[Array, " n"]
+    depth: Float[Array, " n"]
+    valid: Bool[Array, " n"]
+    finite: Bool[Array, " n"]
+
+
+def project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> Splats:
+    """Project a cloud of n Gaussians into one camera.
+
+    The perspective is linearised at each centre, which is first moved to within 1.3 times the field of view: farther
+    out the linearisation would spread a Gaussian over the whole image (Kerbl et al. 2023, and gsplat).
+    """
+    finite = _finite(gaussians)
+    # Masked values go in, not only out: the gradient of a masked result is 0 * NaN otherwise.
+    x, y, z = _masked_columns(gaussians.means, finite)
+    scales = [jnp.exp(s) for s in _masked_columns(gaussians.log_scales, finite)]
+    quats = jnp.where(finite[:, None], gaussians.quats, jnp.ones_like(gaussians.quats))
+
+    r, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
+    cx, cy = camera.intrinsics[0, 2], camera.intrinsics[1, 2]
+    cam_x, cam_y, cam_z = (x * r[i, 0] + y * r[i, 1] + z * r[i, 2] + t[i] for i in range(3))
+    in_front = cam_z > config.near
+    depth = jnp.where(in_front, cam_z, 1.0)
+    inverse_depth = 1 / depth
+    slope_x, slope_y = cam_x * inverse_depth, cam_y * inverse_depth
+
+    margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
+    near_x = depth * jnp.clip(slope_x, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    near_y = depth * jnp.clip(slope_y, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    # Rows of the 2x3 matrix J W: the Jacobian of the perspective times the rotation into the camera.
+    j_xx, j_xz = fx * inverse_depth, -fx * near_x * inverse_depth * inverse_depth
+    j_yy, j_yz = fy * inverse_depth, -fy * near_y * inverse_depth * inverse_depth
+    row_x = [j_xx * r[0, i] + j_xz * r[2, i] for i in range(3)]
+    row_y = [j_yy * r[1, i] + j_yz * r[2, i] for i in range(3)]
+    # Principal axes on the image plane, scaled: the covariance is the sum of their outer products.
+    axes = _rotation_columns(quats)
+    ax = [(row_x[0] * a[0] + row_x[1] * a[1] + row_x[2] * a[2]) * s for a, s in zip(axes, scales, strict=True)]
+    ay = [(row_y[0] * a[0] + row_y[1] * a[1] + row_y[2] * a[2]) * s for a, s in zip(axes, scales, strict=True)]
+    variance_x = ax[0] * ax[0] + ax[1] * ax[1] + ax[2] * ax[2] + config.eps2d
+    variance_y = ay[0] * ay[0] + ay[1] * ay[1] + ay[2] * ay[2] + config.eps2d
+    covariance = ax[0] * ay[0] + ax[1] * ay[1] + ax[2] * ay[2]
+    determinant = variance_x * variance_y - covariance * covariance
+    # Where float32 overflows or loses the determinant, the shape is unknown.
+    has_shape = (determinant > 0) & jnp.isfinite(determinant)
+    inverse = 1 / jnp.where(has_shape, determinant, 1.0)
+    return Splats(
+        x=fx * slope_x + cx,
+        y=fy * slope_y + cy,
+        conic_xx=variance_y * inverse,
+        conic_xy=-covariance * inverse,
+        conic_yy=variance_x * inverse,
+        variance_x=variance_x,
+        variance_y=variance_y,
+        depth=depth,
+        valid=finite & in_front & has_shape,
+        finite=finite & (has_shape | ~in_front),
+    )
+
+
+def _finite(gaussians: Gaussians) -> Bool[Array, " n"]:
+    """False for a Gaussian with a NaN or infinite parameter; an infinite logit is only an opacity of 0 or 1."""
+    columns = [gaussians.means[:, i] for i in range(3)]
+    columns += [gaussians.quats[:, i] for i in range(4)]
+    columns += [jnp.exp(gaussians.log_scales[:, i]) for i in range(3)]
+    columns += [gaussians.colors[:, i] for i in range(gaussians.colors.shape[1])]
+    finite = ~jnp.isnan(gaussians.logit_opacities)
+    for column in columns:
+        finite &= jnp.isfinite(column)
+    return finite
+
+
+def _masked_columns(x: Float[Array, "n 3"], keep: Bool[Array, " n"]) -> list[Float[Array, " n"]]:
+    return [jnp.where(keep, x[:, i], 0.0) for i in range(3)]
+
+
+def _rotation_columns(quats: Float[Array, "n 4"]) -> list[tuple[Float[Array, " n"], ...]]:
+    q = rotations.normalize(quats)
+    w, x, y, z = q[:, 0], q[:, 1], q[:, 2], q[:, 3]
+    return [
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    ]
