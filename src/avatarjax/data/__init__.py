@@ -1,0 +1,1 @@
+"""Avatars, their motion, ground-truth pictures, and datasets made from them."""

@@ -1,0 +1,130 @@
+"""Pieces of clothing and hair as small meshes grown around a shaped body: skirt, boots, hat, hair."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from avatarjax.data.body import Rig
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Piece:
+    """A part of an avatar in its rest pose.
+
+    vertices (v, 3) metres; faces (f, 3); uvs (f, 3, 2) corners in the unit square of the piece; weights (v, j), rows
+    sum to 1; lag (v,) in [0, 1]: how much of the vertex follows the lagged bones.
+    """
+
+    name: str
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    uvs: Float[np.ndarray, "f 3 2"]
+    weights: Float[np.ndarray, "v j"]
+    lag: Float[np.ndarray, " v"]
+
+
+def grid_faces(rows: int, columns: int, *, closed: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles (f, 3) of a grid of rows x columns vertices and their corner uvs (f, 3, 2); closed joins the last
+    column to the first. u runs along the columns, v from 1 at the first row to 0 at the last. Seen with rows going
+    down and columns going counter-clockwise about +y (from +z to +x), the triangles face outwards."""
+    quads = columns if closed else columns - 1
+    r, c = (a.ravel() for a in np.meshgrid(np.arange(rows - 1), np.arange(quads), indexing="ij"))
+    corner_rows = np.stack([r, r + 1, r + 1, r], axis=1)
+    corner_columns = np.stack([c, c, c + 1, c + 1], axis=1)
+    vertex = corner_rows * columns + corner_columns % columns
+    uv = np.stack([corner_columns / quads, 1 - corner_rows / (rows - 1)], axis=-1).astype(np.float32)
+    faces = np.concatenate([vertex[:, [0, 1, 2]], vertex[:, [0, 2, 3]]])
+    return faces.astype(np.int32), np.concatenate([uv[:, [0, 1, 2]], uv[:, [0, 2, 3]]])
+
+
+def one_bone(rig: Rig, name: str, count: int) -> np.ndarray:
+    """Skinning weights (count, j) that are all on one bone."""
+    weights = np.zeros((count, len(rig.names)), np.float32)
+    weights[:, rig.index(name)] = 1
+    return weights
+
+
+def smoothstep(x: np.ndarray, low: typing.SupportsFloat, high: typing.SupportsFloat) -> np.ndarray:
+    """0 below low, 1 above high (or the other way round where high < low), smooth between."""
+    low, high = float(low), float(high)
+    t = np.clip((x - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def outline(points: np.ndarray, centre: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Distance (k,) of the convex outline of points (n, 2) from a centre, along directions (sin, cos) of angles
+    (k,)."""
+    directions = np.stack([np.sin(angles), np.cos(angles)], axis=1)
+    support = ((points - centre) @ directions.T).max(axis=0)
+    # The convex outline is the intersection of its supporting half-planes.
+    facing = directions @ directions.T
+    reach = np.where(facing > 0.05, support[None] / np.maximum(facing, 0.05), np.inf)
+    return reach.min(axis=1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Drape:
+    """How a skirt follows two legs: each of its vertices is skinned twice, to the left and to the right leg.
+
+    left, right (s, j) weights; outward (s, 3) horizontal unit directions away from the body; side (s,) metres to the
+    figure's left. `draping.drape` takes for each vertex the copy that lies further out.
+    """
+
+    left: Float[np.ndarray, "s j"]
+    right: Float[np.ndarray, "s j"]
+    outward: Float[np.ndarray, "s 3"]
+    side: Float[np.ndarray, " s"]
+
+
+def skirt(
+    rig: Rig,
+    body: Float[np.ndarray, "v 3"],
+    *,
+    top: float,
+    bottom: float,
+    flare: float = 0.32,
+    margin: float = 0.012,
+    folds: int = 11,
+    rows: int = 26,
+    columns: int = 66,
+) -> tuple[Piece, Drape]:
+    """A skirt from height `top` to `bottom` around the body vertices (v, 3) (without arms), and how it drapes.
+
+    `flare` is the outward slope, `margin` the distance from the skin, both in metres (per metre).
+    """
+    angles = np.arange(columns) * 2 * np.pi / columns
+    heights = np.linspace(top, bottom, rows)
+    centre = np.array([0.0, rig.heads[rig.index("Hips"), 2]])
+    radius = np.zeros((rows, columns))
+    for i, y in enumerate(heights):
+        slab = body[np.abs(body[:, 1] - y) < 0.03][:, [0, 2]]
+        fitted = outline(slab, centre, angles) + margin
+        fall = heights[i - 1] - y if i else 0.0
+        radius[i] = np.maximum(fitted, radius[i - 1] + flare * fall) if i else fitted
+    drop = (top - heights) / (top - bottom)
+    ripple = 0.018 * drop[:, None] ** 1.5 * np.cos(folds * angles + 0.5 * np.sin(2 * angles))[None]
+    radius = radius + ripple
+    outward = np.stack([np.sin(angles), np.zeros(columns), np.cos(angles)], axis=1)
+    points = outward[None] * radius[..., None] + np.array([centre[0], 0, centre[1]])
+    points[..., 1] = heights[:, None]
+    vertices = points.reshape(-1, 3).astype(np.float32)
+    faces, uvs = grid_faces(rows, columns, closed=True)
+
+    outward = np.tile(outward, (rows, 1)).astype(np.float32)
+    hip = rig.heads[rig.index("LeftUpLeg"), 1]
+    on_leg = smoothstep(vertices[:, 1], hip + 0.05, hip - 0.14)
+    # A bent knee swings the calf up behind: the back of the hem gives way to it.
+    on_shin = 0.3 * smoothstep(vertices[:, 1], bottom + 0.16, bottom) * np.clip(-outward[:, 2], 0, 1)
+    sides = []
+    for name in ("Left", "Right"):
+        weights = one_bone(rig, "Hips", len(vertices)) * (1 - on_leg)[:, None]
+        weights[:, rig.index(name + "UpLeg")] = on_leg * (1 - on_shin)
+        weights[:, rig.index(name + "Leg")] = on_leg * on_shin
+        sides.append(weights.astype(np.float32))
+    lag = 0.45 * np.repeat(drop, columns) ** 1.5
+    piece = Piece("skirt", vertices, faces, uvs, (sides[0] + sides[1]) / 2, lag.astype(np.float32))
+    return piece, Drape(sides[0], sides[1], outward, vertices[:, 0].copy())

@@ -1,0 +1,68 @@
+"""Forward kinematics and linear blend skinning as pure functions of one frame; `jax.vmap` makes them sequences."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from avatarjax import rotations
+from avatarjax.data.body import Rig
+
+
+def _generations(parents: tuple[int, ...]) -> list[np.ndarray]:
+    """Joint indices grouped by their distance from the root."""
+    depth = [0] * len(parents)
+    for j, p in enumerate(parents):
+        depth[j] = depth[p] + 1 if p >= 0 else 0
+    return [np.flatnonzero(np.array(depth) == d) for d in range(max(depth) + 1)]
+
+
+def forward_kinematics(rig: Rig, local_quats: Float[Array, "j 4"], hips: Float[Array, 3]) -> Float[Array, "j 3 4"]:
+    """Transforms (j, 3, 4) that carry points from the rest pose to the posed world, one a bone.
+
+    `local_quats` (j, 4) turn each bone against its parent, the identity being the rest pose; `hips` (3,) is the world
+    position of the hips joint, metres. A whole generation of bones is done at once: 11 steps instead of 52.
+    """
+    local = rotations.to_matrix(local_quats)
+    heads = jnp.asarray(rig.heads)
+    parents = np.array(rig.parents)
+    turn, place = local, jnp.broadcast_to(hips, heads.shape)
+    for joints in _generations(rig.parents)[1:]:
+        up = parents[joints]
+        turn = turn.at[joints].set(jnp.einsum("kab,kbc->kac", turn[up], local[joints]))
+        moved = place[up] + jnp.einsum("kab,kb->ka", turn[up], heads[joints] - heads[up])
+        place = place.at[joints].set(moved)
+    shift = place - jnp.einsum("kab,kb->ka", turn, heads)
+    return jnp.concatenate([turn, shift[..., None]], axis=-1)
+
+
+def skinning_basis(vertices: Float[Array, "v 3"], weights: Float[Array, "v j"]) -> Float[Array, "k v"]:
+    """The matrix (4 j, v) of weighted homogeneous rest positions, with which skinning is one matrix product.
+
+    Dense beats sparse here: 2,000 frames are one product of (6000, 4 j) with (4 j, v), and a gather of four bones a
+    vertex moves more memory.
+    """
+    homogeneous = jnp.concatenate([vertices, jnp.ones((len(vertices), 1))], axis=1)
+    return jnp.einsum("vj,vk->jkv", weights, homogeneous).reshape(-1, len(vertices))
+
+
+def skin(basis: Float[Array, "k v"], transforms: Float[Array, "j 3 4"]) -> Float[Array, "v 3"]:
+    """Linear blend skinning: posed vertices (v, 3) from a `skinning_basis` (4 j, v) and bone transforms (j, 3, 4)."""
+    return (jnp.moveaxis(transforms, 1, 0).reshape(3, -1) @ basis).T
+
+
+def joint_positions(rig: Rig, transforms: Float[Array, "j 3 4"]) -> Float[Array, "j 3"]:
+    """World positions (j, 3) of the bones' heads."""
+    return jnp.einsum("jab,jb->ja", transforms[..., :3], jnp.asarray(rig.heads)) + transforms[..., 3]
+
+
+def sole_points(rig: Rig, transforms: Float[Array, "j 3 4"]) -> Float[Array, "2 s 3"]:
+    """World positions (2, s, 3) of the points under the left and the right foot."""
+    soles = jnp.asarray(rig.soles)
+    half = soles.shape[1] // 2
+    bones = [
+        [rig.index(side + bone) for bone in ("Foot", "ToeBase") for _ in range(half)] for side in ("Left", "Right")
+    ]
+    moves = transforms[np.array(bones)]
+    return jnp.einsum("fsab,fsb->fsa", moves[..., :3], soles) + moves[..., 3]

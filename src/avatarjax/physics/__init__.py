@@ -1,0 +1,1 @@
+"""What moves by itself: springs, mass-spring-damper systems, cloth."""
