@@ -1,0 +1,1 @@
+"""Diffusion as pure functions: DDPM schedules, objectives, DDIM and EDM samplers as `lax.scan`."""

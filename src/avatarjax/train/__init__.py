@@ -1,0 +1,6 @@
+"""Training: a state pytree, one jitted step, a loop that resumes, and logs that people can read."""
+
+from avatarjax.train.loop import fit, read_metrics
+from avatarjax.train.state import TrainState, make_step, new_state, weights
+
+__all__ = ["TrainState", "fit", "make_step", "new_state", "read_metrics", "weights"]

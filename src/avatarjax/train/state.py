@@ -1,0 +1,81 @@
+"""The training state as a pytree, and the one jitted step that every stage uses."""
+
+from __future__ import annotations
+
+import typing
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+Params = typing.Any
+Batch = typing.Any
+Metrics = dict[str, Float[Array, ""]]
+Loss = typing.Callable[[Params, Key[Array, ""], Batch], tuple[Float[Array, ""], Metrics]]
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class TrainState:
+    """Parameters, their running average (None if none is kept), optimiser state, PRNG key and number of steps done."""
+
+    params: PyTree
+    average: PyTree | None
+    opt_state: PyTree
+    key: Key[Array, ""]
+    step: Int[Array, ""]
+
+
+def optimiser(learning_rate: float, steps: int, *, clip: float = 1.0) -> optax.GradientTransformation:
+    """Adam with gradient clipping, a warm-up over the first 3 % of `steps` and a cosine decay to a tenth."""
+    warmup = max(1, min(200, steps * 3 // 100))
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.05 * learning_rate, learning_rate, warmup, max(steps, warmup + 1), 0.1 * learning_rate
+    )
+    return optax.chain(optax.clip_by_global_norm(clip), optax.adam(schedule, b2=0.99))
+
+
+def new_state(
+    params: Params, transform: optax.GradientTransformation, key: Key[Array, ""], *, averaged: bool = False
+) -> TrainState:
+    """A state before its first step. `averaged` keeps an exponential moving average of the parameters."""
+    average = jax.tree.map(jnp.copy, params) if averaged else None
+    return TrainState(params, average, transform.init(params), key, jnp.zeros((), jnp.int32))
+
+
+def weights(state: TrainState) -> Params:
+    """The parameters to use after training: the average where there is one."""
+    return state.params if state.average is None else state.average
+
+
+def make_step(
+    loss: Loss, transform: optax.GradientTransformation, *, decay: float = 0.0
+) -> typing.Callable[[TrainState, Batch], tuple[TrainState, Metrics]]:
+    """A jitted `(state, batch) -> (state, metrics)` with donated state.
+
+    `loss(params, key, batch)` returns the loss and more metrics; `decay` is that of the average of the weights. The
+    metrics hold the loss and the gradient norm; a step whose gradient is not finite changes nothing and counts in
+    `skipped`.
+    """
+
+    def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
+        key = jax.random.fold_in(state.key, state.step)
+        (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(state.params, key, batch)
+        norm = optax.global_norm(gradient)
+        good = jnp.isfinite(norm)
+        gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
+        updates, opt_state = transform.update(gradient, state.opt_state, state.params)
+        params = optax.apply_updates(state.params, updates)
+        keep = lambda new, old: jax.tree.map(lambda n, o: jnp.where(good, n, o), new, old)  # noqa: E731
+        params, opt_state = keep(params, state.params), keep(opt_state, state.opt_state)
+        average = state.average
+        if average is not None:
+            # A young average follows the weights closely, so that it forgets where they started.
+            rate = jnp.minimum(decay, (1.0 + state.step) / (10.0 + state.step))
+            average = jax.tree.map(lambda a, p: rate * a + (1 - rate) * p, average, params)
+        new = TrainState(params, average, opt_state, state.key, state.step + 1)
+        return new, {"loss": value, "gradient_norm": norm, "skipped": 1.0 - good, **metrics}
+
+    return jax.jit(step, donate_argnums=0)

@@ -1,0 +1,193 @@
+"""Every size and number of a UNICA run, as one frozen dataclass with presets by name.
+
+Presets run the same code with different numbers: `ci` in minutes on two CPU cores, `small` is the default on a CPU,
+`base` is for one GPU, `paper` is UNICA C.1 and C.2 in full. A comment says whose a value is where it is not the paper's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+
+from avatarjax.nets.point_transformer import PointTransformerConfig
+from avatarjax.unica.appearance import AppearanceConfig
+from avatarjax.unica.coefficients import CoefficientConfig
+from avatarjax.unica.denoiser import DenoiserConfig
+from avatarjax.unica.latent import LatentConfig
+from avatarjax.unica.vae import VAEConfig
+
+DynamicsName = typing.Literal["coefficients", "unet"]
+PresetName = typing.Literal["ci", "small", "base", "paper"]
+
+
+@dataclasses.dataclass(frozen=True)
+class StageConfig:
+    """One training stage: number of steps, batch size, peak learning rate (linear warm-up, cosine decay to a tenth)."""
+
+    steps: int
+    batch: int
+    learning_rate: float
+    ema: float = 0.0  # ours; 0 keeps no average of the weights
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """What is simulated and rendered. The paper has 6,253 frames an avatar and renders every one in 50 views."""
+
+    transition_frames: int = 312
+    held_out_frames: int = 150
+    image_poses: int = 6253
+    image_views: int = 50
+    standing_views: int = 50
+    image_size: int = 1024
+
+
+@dataclasses.dataclass(frozen=True)
+class UnicaConfig:
+    """A whole run. `dynamics` names the model behind `step`; the other one is trained too where `train_both` is set."""
+
+    size: int = 128
+    upscaled: int = 1024
+    pca_components: int = 200
+    actions: int = 5
+    dynamics: DynamicsName = "unet"
+    train_both: bool = False
+    data: DataConfig = DataConfig()
+    latent: LatentConfig = LatentConfig()
+    coefficients: CoefficientConfig = CoefficientConfig()
+    appearance: AppearanceConfig = AppearanceConfig()
+    turn_window: tuple[int, int] = (0, 25)  # frames after a key change that count as turning; code: (-5, 40)
+    turn_fraction: float = 0.7  # of the second stage's samples
+    views_per_step: int = 8
+    loss_l1: float = 0.8  # ours; 3DGS' weights, the paper gives none
+    loss_ssim: float = 0.2
+    vae_stage: StageConfig = StageConfig(300_000, 32, 1.5e-5)
+    unet1_stage: StageConfig = StageConfig(100_000, 32, 5e-5)
+    unet2_stage: StageConfig = StageConfig(200_000, 32, 5e-5)
+    coefficients_stage: StageConfig = StageConfig(30_000, 128, 1e-3, ema=0.998)  # ours
+    base_stage: StageConfig = StageConfig(3_000, 8, 1e-2)  # ours
+    appearance_stage: StageConfig = StageConfig(15_600, 8, 1e-4)
+
+    def __post_init__(self):
+        side = self.size // self.latent.vae.downsampling
+        if self.size % 32 or side % 2 ** (len(self.latent.denoiser.channels) - 1):
+            raise ValueError(f"a map of side {self.size} cannot be halved as often as the networks do")
+        if self.upscaled % self.size:
+            raise ValueError(f"upscaled side {self.upscaled} must be a multiple of the map's side {self.size}")
+
+
+def _base() -> UnicaConfig:
+    return UnicaConfig(
+        upscaled=512,
+        data=DataConfig(image_poses=1500, image_views=12, image_size=512),
+        latent=LatentConfig(
+            vae=VAEConfig(channels=(64, 128, 256, 256)),
+            denoiser=DenoiserConfig(channels=(128, 256, 512, 512), head_width=64, action_features=256),
+        ),
+        vae_stage=StageConfig(30_000, 32, 1e-4),
+        unet1_stage=StageConfig(30_000, 32, 1e-4),
+        unet2_stage=StageConfig(60_000, 32, 1e-4),
+        base_stage=StageConfig(2_000, 8, 1e-2),
+        appearance_stage=StageConfig(8_000, 4, 2e-4),
+    )
+
+
+def _small() -> UnicaConfig:
+    return UnicaConfig(
+        size=64,
+        upscaled=256,
+        pca_components=120,
+        dynamics="coefficients",
+        data=DataConfig(transition_frames=300, image_poses=160, image_views=8, standing_views=50, image_size=256),
+        latent=LatentConfig(
+            vae=VAEConfig(channels=(32, 64, 128), residual_blocks=1),
+            denoiser=DenoiserConfig(channels=(64, 128, 256), residual_blocks=1, head_width=32, action_features=128),
+        ),
+        coefficients=CoefficientConfig(components=96),
+        appearance=AppearanceConfig(
+            transformer=PointTransformerConfig(
+                encoder_channels=(32, 64, 96),
+                encoder_depths=(1, 1, 2),
+                encoder_heads=(2, 4, 6),
+                strides=(2, 2),
+                decoder_channels=(32, 64),
+                decoder_depths=(1, 1),
+                decoder_heads=(2, 4),
+                patch=128,
+                expansion=2,
+            ),
+            head_width=64,
+            head_layers=3,
+            offset_bound=0.05,
+        ),
+        views_per_step=4,
+        vae_stage=StageConfig(3_000, 16, 5e-4),
+        unet1_stage=StageConfig(1_500, 8, 3e-4),
+        unet2_stage=StageConfig(3_000, 8, 3e-4),
+        coefficients_stage=StageConfig(6_000, 128, 1e-3, ema=0.998),
+        base_stage=StageConfig(400, 4, 2e-2),
+        appearance_stage=StageConfig(600, 1, 1e-3),
+    )
+
+
+def _ci() -> UnicaConfig:
+    return UnicaConfig(
+        size=32,
+        upscaled=128,
+        pca_components=64,
+        dynamics="coefficients",
+        train_both=True,
+        data=DataConfig(
+            transition_frames=120,
+            held_out_frames=80,
+            image_poses=48,
+            image_views=6,
+            standing_views=50,
+            image_size=64,
+        ),
+        latent=LatentConfig(
+            vae=VAEConfig(channels=(16, 32, 32), residual_blocks=1),
+            denoiser=DenoiserConfig(channels=(32, 64), residual_blocks=1, head_width=16, action_features=64),
+            sample_steps=4,
+        ),
+        coefficients=CoefficientConfig(components=32, width=192, depth=2, condition=64),
+        appearance=AppearanceConfig(
+            transformer=PointTransformerConfig(
+                encoder_channels=(16, 32),
+                encoder_depths=(1, 1),
+                encoder_heads=(2, 4),
+                strides=(2,),
+                decoder_channels=(16,),
+                decoder_depths=(1,),
+                decoder_heads=(2,),
+                patch=64,
+                grid=64,
+                expansion=2,
+            ),
+            head_width=32,
+            head_layers=2,
+            offset_bound=0.05,
+        ),
+        views_per_step=4,
+        vae_stage=StageConfig(1_200, 32, 2e-3),
+        unet1_stage=StageConfig(300, 16, 1e-3),
+        unet2_stage=StageConfig(700, 16, 1e-3),
+        coefficients_stage=StageConfig(4_000, 128, 2e-3, ema=0.998),
+        base_stage=StageConfig(150, 4, 3e-2),
+        appearance_stage=StageConfig(250, 2, 2e-3),
+    )
+
+
+PRESETS: dict[str, typing.Callable[[], UnicaConfig]] = {
+    "ci": _ci,
+    "small": _small,
+    "base": _base,
+    "paper": UnicaConfig,
+}
+
+
+def preset(name: str, **changes: typing.Any) -> UnicaConfig:
+    """The preset of this name with fields replaced; ValueError that lists the names for an unknown one."""
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset {name!r}: choose one of {', '.join(PRESETS)}")
+    return dataclasses.replace(PRESETS[name](), **changes)

@@ -1,0 +1,143 @@
+"""The faithful dynamics: latent diffusion of the next position map by the action-conditioned UNet (UNICA 3.4, 3.6)."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from avatarjax import posmap
+from avatarjax.diffusion import samplers, schedules
+from avatarjax.nets.functional import Params, bind
+from avatarjax.posmap import Atlas
+from avatarjax.unica.denoiser import Denoiser, DenoiserConfig
+from avatarjax.unica.vae import VAE, VAEConfig, kl_divergence, sample_latent
+
+CONTEXT = 3
+BACKGROUND = 0.5  # ours; zero after scaling to [-1, 1]. The public files have 0, the released code also 0.5 and -1.
+
+
+@dataclasses.dataclass(frozen=True)
+class LatentConfig:
+    """Autoencoder, UNet and diffusion. Where the paper is silent, the comment says whose choice a value is."""
+
+    vae: VAEConfig = VAEConfig()
+    denoiser: DenoiserConfig = DenoiserConfig()
+    kl_weight: float = 1e-6  # ours; Stable Diffusion's
+    schedule: schedules.ScheduleName = "scaled_linear"  # code
+    train_timesteps: int = 1000  # code
+    sample_steps: int = 10  # paper
+    guidance: float = 1.0  # code
+    action_dropout: float = 0.1  # ours; usual for guidance
+    context_noise: float = 0.1  # ours; the largest standard deviation, in units of the latents'
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class LatentDynamics:
+    """Trained weights: autoencoder, UNet, and the mean and standard deviation (l,) that bring latents to unit size."""
+
+    vae: Params
+    denoiser: Params
+    latent_mean: Float[Array, "l"]
+    latent_scale: Float[Array, "l"]
+
+
+def to_images(atlas: Atlas, texels: Float[Array, "b t 3"]) -> Float[Array, "b h w 3"]:
+    """Normalised texels as maps in [-1, 1] with a background of 0, the autoencoder's input."""
+    return jax.vmap(lambda x: 2 * posmap.to_map(atlas, x, BACKGROUND) - 1)(texels)
+
+
+def from_images(atlas: Atlas, images: Float[Array, "b h w 3"]) -> Float[Array, "b t 3"]:
+    """The inverse of `to_images` on the foreground."""
+    return jax.vmap(lambda x: posmap.from_map(atlas, x) / 2 + 0.5)(images)
+
+
+def vae_loss(
+    config: LatentConfig, atlas: Atlas, params: Params, key: Key[Array, ""], texels: Float[Array, "b t 3"]
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """Reconstruction on the foreground plus weighted KL divergence (UNICA 3.6), and the error in normalised units."""
+    vae = bind(VAE, config.vae, params)
+    mean, log_variance = vae.encode(to_images(atlas, texels))
+    decoded = from_images(atlas, vae.decode(sample_latent(mean, log_variance, key)))
+    reconstruction = jnp.mean((2 * (decoded - texels)) ** 2)
+    kl = kl_divergence(mean, log_variance)
+    return reconstruction + config.kl_weight * kl, {"rmse": jnp.sqrt(reconstruction) / 2, "kl": kl}
+
+
+def encode(
+    config: LatentConfig, atlas: Atlas, dynamics: LatentDynamics, texels: Float[Array, "b t 3"]
+) -> Float[Array, "b u v l"]:
+    """Latent means of unit size."""
+    mean, _ = bind(VAE, config.vae, dynamics.vae).encode(to_images(atlas, texels))
+    shape = (1, 1, 1, -1)
+    return (mean - dynamics.latent_mean.reshape(shape)) / dynamics.latent_scale.reshape(shape)
+
+
+def decode(
+    config: LatentConfig, atlas: Atlas, dynamics: LatentDynamics, latents: Float[Array, "b u v l"]
+) -> Float[Array, "b t 3"]:
+    """Normalised texels of unit-size latents."""
+    shape = (1, 1, 1, -1)
+    latents = latents * dynamics.latent_scale.reshape(shape) + dynamics.latent_mean.reshape(shape)
+    return from_images(atlas, bind(VAE, config.vae, dynamics.vae).decode(latents))
+
+
+def diffusion_loss(
+    config: LatentConfig,
+    atlas: Atlas,
+    dynamics: LatentDynamics,
+    key: Key[Array, ""],
+    groups: Float[Array, "b 4 t 3"],
+    action: Int[Array, "b"],
+) -> Float[Array, ""]:
+    """Epsilon loss on the fourth frame, with context noise and action dropout (UNICA Eq. 5 and 3.6)."""
+    time_key, noise_key, drop_key, level_key, context_key = jax.random.split(key, 5)
+    b, frames, t, _ = groups.shape
+    latents = encode(config, atlas, dynamics, groups.reshape(b * frames, t, 3))
+    latents = jax.lax.stop_gradient(latents).reshape(b, frames, *latents.shape[1:])
+    context, target = latents[:, :CONTEXT], latents[:, CONTEXT]
+
+    level = config.context_noise * jax.random.uniform(level_key, (b, CONTEXT, 1, 1, 1))
+    context = context + level * jax.random.normal(context_key, context.shape)
+    timestep = jax.random.randint(time_key, (b,), 0, config.train_timesteps)
+    noise = jax.random.normal(noise_key, target.shape)
+    signal = schedules.alphas_cumprod(config.schedule, config.train_timesteps)
+    noisy = schedules.add_noise(signal, target, noise, timestep)
+    dropped = jax.random.uniform(drop_key, (b,)) < config.action_dropout
+    action = jnp.where(dropped, config.denoiser.null_action, action)
+    network = bind(Denoiser, config.denoiser, dynamics.denoiser)
+    predicted = network(jnp.concatenate([context, noisy[:, None]], axis=1), timestep, action)
+    return jnp.mean((predicted - noise) ** 2)
+
+
+def sample(
+    config: LatentConfig,
+    atlas: Atlas,
+    dynamics: LatentDynamics,
+    key: Key[Array, ""],
+    context: Float[Array, "b 3 t 3"],
+    action: Int[Array, "b"],
+) -> Float[Array, "b t 3"]:
+    """The next frame's normalised texels from three normalised frames, by DDIM (UNICA 3.7)."""
+    b, frames, t, _ = context.shape
+    latents = encode(config, atlas, dynamics, context.reshape(b * frames, t, 3))
+    latents = latents.reshape(b, frames, *latents.shape[1:])
+    network = bind(Denoiser, config.denoiser, dynamics.denoiser)
+
+    def predictor(action):
+        return lambda x, tau: network(jnp.concatenate([latents, x[:, None]], axis=1), jnp.full(b, tau), action)
+
+    start = jax.random.normal(key, (b, *latents.shape[2:]))
+    nobody = jnp.full_like(action, config.denoiser.null_action)
+    clean = samplers.ddim(
+        samplers.guided(predictor(action), predictor(nobody), config.guidance),
+        start,
+        schedules.alphas_cumprod(config.schedule, config.train_timesteps),
+        schedules.ddim_timesteps(config.train_timesteps, config.sample_steps),
+    )
+    return decode(config, atlas, dynamics, clean)

@@ -1,0 +1,166 @@
+"""An avatar that answers keys: `reset`, `step` and `rollout` as pure functions (UNICA 3.7).
+
+Each round predicts the next frame in the space where the root of frame t is at the origin, adds the movement to a world
+offset, and renormalises before the next round, so an avatar can walk any distance. PCA, the appearance network and the
+Procrustes fit act only on what is shown, never on what is fed back.
+"""
+
+from __future__ import annotations
+
+import typing
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from avatarjax import posmap
+from avatarjax.gaussians import Gaussians
+from avatarjax.nets.functional import Params
+from avatarjax.posmap import Atlas, Upscaler
+from avatarjax.posmap import pca as pcs
+from avatarjax.unica import align, appearance, coefficients, latent
+from avatarjax.unica.coefficients import CoefficientDynamics
+from avatarjax.unica.config import UnicaConfig
+from avatarjax.unica.latent import LatentDynamics
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class Avatar:
+    """Everything that a trained avatar is.
+
+    `standing` (t, 3) are the texels of the standing pose in metres with the root above the world's origin; `pca` is the
+    basis of normalised fourth maps. `dynamics` is either of the two models; `config` is static.
+    """
+
+    atlas: Atlas
+    upscaler: Upscaler
+    pca: pcs.PCA
+    base: appearance.BaseAttributes
+    appearance: Params
+    dynamics: CoefficientDynamics | LatentDynamics
+    standing: Float[Array, "t 3"]
+    config: UnicaConfig = flax.struct.field(pytree_node=False)
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class State:
+    """Where a rollout is: the context of the dynamics model, the world position (3,) of the root in metres, a PRNG key.
+
+    The context holds the last three frames with the root of the newest at the origin: normalised texels (3, t, 3) for
+    the UNet, `coefficients.Context` for the coefficient model.
+    """
+
+    context: typing.Any
+    offset: Float[Array, "3"]
+    key: Key[Array, ""]
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class Info:
+    """What a user may want to watch: distance of the generated texels to the PCA span and the lowest texel's height.
+
+    pca_residual () root mean square in metres; ground () metres, 0 for a foot on the floor: a trend is vertical drift.
+    """
+
+    pca_residual: Float[Array, ""]
+    ground: Float[Array, ""]
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class Frame:
+    """One generated frame: normalised position map (h, w, 3), world Gaussians (None if not asked for), root (3,)."""
+
+    posmap: Float[Array, "h w 3"]
+    gaussians: Gaussians | None
+    root: Float[Array, "3"]
+    info: Info
+
+
+def reset(avatar: Avatar, key: Key[Array, ""]) -> State:
+    """The state before the first key: standing at the world's origin, the standing map three times (UNICA C.4)."""
+    if isinstance(avatar.dynamics, LatentDynamics):
+        texels = posmap.normalize(avatar.atlas, avatar.standing, posmap.root(avatar.atlas, avatar.standing))
+        context = jnp.repeat(texels[None], latent.CONTEXT, axis=0)
+    else:
+        flat, root = coefficients.canonical(avatar.atlas, avatar.standing)
+        pose = pcs.project(avatar.dynamics.basis, flat)
+        root = root.at[:2].set(0.0)
+        context = coefficients.Context(
+            pose=jnp.repeat(pose[None], coefficients.CONTEXT, axis=0),
+            root=jnp.repeat(root[None], coefficients.CONTEXT, axis=0),
+        )
+    return State(context, posmap.root(avatar.atlas, avatar.standing), key)
+
+
+def step(avatar: Avatar, state: State, action: Int[Array, ""] | int) -> tuple[State, Frame]:
+    """The next frame under an action id (0 idle, 1 W, 2 S, 3 A, 4 D in the shipped vocabulary).
+
+    An id outside the vocabulary is clamped to it, as JAX indexes; check ids before a jitted call.
+    """
+    return _step(avatar, state, jnp.asarray(action, jnp.int32), True)
+
+
+def rollout(
+    avatar: Avatar, state: State, actions: Int[Array, "frames"], *, gaussians: bool = True
+) -> tuple[State, Frame]:
+    """`step` over a sequence of actions as one `lax.scan`: the last state, and frames with a leading time axis.
+
+    `gaussians=False` skips appearance and leaves `frames.gaussians` None; `dress` can make them later, frame by frame.
+    """
+    return jax.lax.scan(lambda s, a: _step(avatar, s, a, gaussians), state, jnp.asarray(actions, jnp.int32))
+
+
+def dress(avatar: Avatar, frame: Frame) -> Gaussians:
+    """World Gaussians of a frame's geometry: PCA, upscaling, appearance network, Procrustes fit."""
+    texels = posmap.from_map(avatar.atlas, frame.posmap)
+    # The map is normalised about the root of the frame before; its own root tells where that is in the world.
+    origin = frame.root - (posmap.root(avatar.atlas, texels) - 0.5) / avatar.atlas.scale
+    points = posmap.upscale(avatar.upscaler, pcs.align(avatar.pca, texels))
+    box = align.bounding_box(points)
+    coarse = appearance.coarse_gaussians(avatar.base, align.into_box(box, points), box.side / avatar.atlas.scale)
+    refined = appearance.refine(avatar.config.appearance, avatar.appearance, coarse)
+    return align.place(refined, posmap.denormalize(avatar.atlas, points, origin))
+
+
+def _step(avatar: Avatar, state: State, action: Int[Array, ""], gaussians: bool) -> tuple[State, Frame]:
+    key, sample_key = jax.random.split(state.key)
+    advance = _advance_latent if isinstance(avatar.dynamics, LatentDynamics) else _advance_coefficients
+    context, texels = advance(avatar, state, sample_key, action)
+
+    # Movement accumulation (Eq. 7): in the shared space of the group, the root has moved from 0.5 to here.
+    root = state.offset + (posmap.root(avatar.atlas, texels) - 0.5) / avatar.atlas.scale
+    residual = (texels - pcs.align(avatar.pca, texels)) / avatar.atlas.scale
+    info = Info(
+        pca_residual=jnp.sqrt(jnp.mean(jnp.sum(residual**2, axis=-1))),
+        ground=jnp.min(texels[:, 1] - 0.5) / avatar.atlas.scale + state.offset[1],
+    )
+    frame = Frame(posmap.to_map(avatar.atlas, texels), None, root, info)
+    if gaussians:
+        frame = frame.replace(gaussians=dress(avatar, frame))
+    return State(context, root, key), frame
+
+
+def _advance_latent(avatar: Avatar, state: State, key, action):
+    """The next normalised texels, and the context renormalised about them (Eq. 8)."""
+    texels = latent.sample(
+        avatar.config.latent, avatar.atlas, avatar.dynamics, key, state.context[None], action[None]
+    )[0]
+    context = jnp.concatenate([state.context[1:], texels[None]])
+    return context - (posmap.root(avatar.atlas, texels) - 0.5)[None, None], texels
+
+
+def _advance_coefficients(avatar: Avatar, state: State, key, action):
+    """The same from coefficients: heights are absolute there, ground positions relative to the offset."""
+    batched = jax.tree.map(lambda x: x[None], state.context)
+    pose, root = coefficients.sample(avatar.config.coefficients, avatar.dynamics, key, batched, action[None])
+    context = coefficients.push(batched, pose, root)
+    ground = jnp.concatenate([root[:, None, :2], jnp.zeros((1, 1, 1))], axis=-1)
+    context = context.replace(root=context.root - ground)
+    height = jnp.zeros(3).at[1].set(state.offset[1])
+    texels = coefficients.world_texels(avatar.dynamics, pose[0], root[0])
+    return jax.tree.map(lambda x: x[0], context), posmap.normalize(avatar.atlas, texels, height)
