@@ -30,7 +30,9 @@ def forward_kinematics(rig: Rig, local_quats: Float[Array, "j 4"], hips: Float[A
     turn, place = local, jnp.broadcast_to(hips, heads.shape)
     for joints in _generations(rig.parents)[1:]:
         up = parents[joints]
-        turn = turn.at[joints].set(jnp.einsum("kab,kbc->kac", turn[up], local[joints]))
+        # Sums, not a batched product of 3x3 matrices: XLA's CPU compiler fails on that one under vmap in a scan.
+        turned = jnp.sum(turn[up][:, :, :, None] * local[joints][:, None], axis=2)
+        turn = turn.at[joints].set(turned)
         moved = place[up] + jnp.einsum("kab,kb->ka", turn[up], heads[joints] - heads[up])
         place = place.at[joints].set(moved)
     shift = place - jnp.einsum("kab,kb->ka", turn, heads)

@@ -30,7 +30,7 @@ def save_tree(path: str | os.PathLike, tree: PyTree, **metadata: typing.Any) -> 
     arrays = {}
     for key, leaf in jax.tree_util.tree_leaves_with_path(tree):
         leaf = jax.random.key_data(leaf) if _is_key(leaf) else leaf
-        arrays[_key_string(key)] = np.ascontiguousarray(leaf)
+        arrays[_key_string(key)] = np.asarray(leaf, order="C")
     with atomic.replacing(path) as temporary:
         save_file(arrays, str(temporary), metadata={"avatarjax": json.dumps(metadata)})
 
