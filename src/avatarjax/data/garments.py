@@ -10,6 +10,9 @@ from jaxtyping import Float, Int
 
 from avatarjax.data.body import Rig
 
+# A number, or one for each element.
+_Edge = np.ndarray | typing.SupportsFloat
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Piece:
@@ -48,9 +51,8 @@ def one_bone(rig: Rig, name: str, count: int) -> np.ndarray:
     return weights
 
 
-def smoothstep(x: np.ndarray, low: typing.SupportsFloat, high: typing.SupportsFloat) -> np.ndarray:
+def smoothstep(x: np.ndarray, low: _Edge, high: _Edge) -> np.ndarray:
     """0 below low, 1 above high (or the other way round where high < low), smooth between."""
-    low, high = float(low), float(high)
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 

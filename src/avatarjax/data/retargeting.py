@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 FPS = 30.0
 # The emote skeletons are exported in centimetres below a root that is in metres.
 _CHILD_UNIT = 0.01
+# How much of a bone's own turn is kept, against its parent's: the emotes' heads and collar bones rest differently.
+_SHARES = {"Head": 0.5, "Shoulder": 0.3}
 _COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
@@ -110,8 +112,8 @@ def retarget(
 ) -> Float[np.ndarray, "f j 4"]:
     """Local rotations (f, j, 4) relative to the rig's rest pose that give its bones the world orientations of the clip.
 
-    The thumbs follow the hand (the clip's thumb axes differ), and the head takes half of the clip's nod, which was made
-    for a larger head. Neighbouring frames are in one hemisphere.
+    The thumbs follow the hand (the clip's thumb axes differ); heads and collar bones follow in part. Neighbouring
+    frames are in one hemisphere.
     """
     frames = len(orientations["Hips"])
     world = np.zeros((frames, len(names), 3, 3))
@@ -120,8 +122,9 @@ def retarget(
             world[:, j] = world[:, parents[j]]
             continue
         world[:, j] = orientations[name] @ _rest_frame(name, tails[j] - heads[j]).T
-        if name == "Head":
-            u, _, vt = np.linalg.svd(world[:, j] + world[:, parents[j]])
+        share = _SHARES.get(name.removeprefix("Left").removeprefix("Right"))
+        if share is not None:
+            u, _, vt = np.linalg.svd(share * world[:, j] + (1 - share) * world[:, parents[j]])
             world[:, j] = u @ vt
     local = world.copy()
     for j, p in enumerate(parents):
