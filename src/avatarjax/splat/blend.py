@@ -23,38 +23,41 @@ from avatarjax.splat.config import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Spla
 from avatarjax.splat.project import Splats
 from avatarjax.splat.tiles import TileGrid, TileLists
 
-# Columns of the table of Gaussians; channels to blend follow.
+# Columns of the table of Gaussians; those from _CHANNELS on are blended.
 _X, _Y, _XX, _XY, _YY, _LOG_OPACITY, _CHANNELS = range(7)
 _MIN_LANES = 16
 
 
-def pack(splats: Splats, log_opacities: Float[Array, " n"], channels: Float[Array, "n c"]) -> Float[Array, "n+1 6+c"]:
-    """The table that `blend` reads, one row per Gaussian and a last one that is transparent.
-
-    The conic is stored with the factors of the exponent -(xx dx^2 + 2 xy dx dy + yy dy^2) / 2 in it.
-    """
-    columns = [splats.x, splats.y, -0.5 * splats.conic_xx, -splats.conic_xy, -0.5 * splats.conic_yy, log_opacities]
-    table = jnp.concatenate([jnp.stack(columns, axis=1), channels], axis=1)
-    transparent = jnp.zeros((1, table.shape[1]), table.dtype).at[0, _LOG_OPACITY].set(-1e9)
-    return jnp.concatenate([table, transparent])
+def columns_of(splats: Splats, channels: Float[Array, "n c"]) -> list[Float[Array, " n"]]:
+    """What `blend` reads of n Gaussians; the conic with the factors of -(xx dx^2 + 2 xy dx dy + yy dy^2) / 2 in it."""
+    columns = [splats.x, splats.y, -0.5 * splats.conic_xx, -splats.conic_xy, -0.5 * splats.conic_yy, splats.log_opacity]
+    return columns + [channels[:, c] for c in range(channels.shape[1])]
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
-def blend(table: Float[Array, "n k"], lists: TileLists, grid: TileGrid, config: SplatConfig) -> Float[Array, "t c p"]:
-    """Blend the channels of `pack`'s table over every tile; the last of the c = k - 5 results is the transmittance.
+def blend(
+    columns: list[Float[Array, " n"]], lists: TileLists, grid: TileGrid, config: SplatConfig
+) -> Float[Array, "t c p"]:
+    """Blend the channels in `columns_of` over every tile; the last of the c results is the transmittance.
 
-    Differentiable with respect to the table. An entry counts from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is
+    Differentiable with respect to the columns. An entry counts from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is
     finished once no pixel of it lets more than TRANSMITTANCE_MIN through. Under `jax.vmap` the scenes are blended one
     after another.
     """
-    forward = functools.partial(
-        _forward, grid=grid, lanes=_lanes(config.forward_lanes, grid), steps=config.forward_steps
-    )
+    return _blend_table(_table(columns), lists, grid, config)
+
+
+def _blend_table(
+    table: Float[Array, "n k"], lists: TileLists, grid: TileGrid, config: SplatConfig
+) -> Float[Array, "t c p"]:
+    lanes = _lanes(config.forward_lanes, grid)
+    forward = functools.partial(_forward, grid=grid, lanes=lanes, steps=config.forward_steps)
     return jax.custom_batching.sequential_vmap(forward)(table, lists)
 
 
-def _blend_fwd(table, lists, grid, config):
-    blended = blend(table, lists, grid, config)
+def _blend_fwd(columns, lists, grid, config):
+    table = _table(columns)
+    blended = _blend_table(table, lists, grid, config)
     return blended, (table, lists, blended)
 
 
@@ -63,10 +66,22 @@ def _blend_bwd(grid, config, residuals, cotangent):
     lanes = _lanes(config.backward_lanes, grid)
     backward = functools.partial(_backward, grid=grid, lanes=lanes, steps=config.backward_steps)
     gradient = jax.custom_batching.sequential_vmap(backward)(table, lists, blended, cotangent)
-    return gradient, None
+    return [gradient[:-1, k] for k in range(gradient.shape[1])], None
 
 
 blend.defvjp(_blend_fwd, _blend_bwd)
+
+
+def _table(columns: list[Float[Array, " n"]]) -> Float[Array, "n+1 k"]:
+    """One row per Gaussian, which a lane reads at once, and a last row that is transparent.
+
+    Written column by column: a fused `jnp.stack` on CPU computes the projection again for every element.
+    """
+    n = columns[0].shape[0]
+    table = jnp.zeros((n + 1, len(columns)), jnp.float32).at[n, _LOG_OPACITY].set(-1e9)
+    for k, column in enumerate(columns):
+        table = table.at[:n, k].set(column)
+    return table
 
 
 def _lanes(most: int, grid: TileGrid) -> int:

@@ -43,8 +43,8 @@ class SplatConfig:
         for name in ("tile_width", "tile_height", "forward_lanes", "forward_steps", "backward_lanes", "backward_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.near <= 0 or self.eps2d < 0:
-            raise ValueError(f"near must be positive and eps2d not negative, got {self.near} and {self.eps2d}")
+        if self.near <= 0 or self.eps2d <= 0:
+            raise ValueError(f"near and eps2d must be positive, got {self.near} and {self.eps2d}")
 
 
 def default_capacity(n_gaussians: int, n_tiles: int) -> int:

@@ -15,13 +15,16 @@ from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
 from avatarjax.splat.config import SplatConfig
 
+# Square pixels. The determinant of larger covariances would come near the largest float32.
+_VARIANCE_MAX = 1e15
+
 
 class Splats(typing.NamedTuple):
     """n projected Gaussians; all values of those that are not `valid` are finite and without meaning.
 
     x, y: centre in pixels. conic_xx, conic_xy, conic_yy: inverse of the 2D covariance, 1/pixel^2. variance_x,
-    variance_y: diagonal of the 2D covariance, pixel^2. depth: metres along the optical axis. valid: finite and in
-    front of the near plane. finite: whether the Gaussian is free of NaN, infinity and overflow.
+    variance_y: diagonal of the 2D covariance, pixel^2. log_opacity: natural logarithm. depth: metres along the optical
+    axis. valid: finite and in front of the near plane. finite: free of NaN, infinity and overflow.
     """
 
     x: Float[Array, " n"]
@@ -31,6 +34,7 @@ class Splats(typing.NamedTuple):
     conic_yy: Float[Array, " n"]
     variance_x: Float[Array, " n"]
     variance_y: Float[Array, " n"]
+    log_opacity: Float[Array, " n"]
     depth: Float[Array, " n"]
     valid: Bool[Array, " n"]
     finite: Bool[Array, " n"]
@@ -72,10 +76,12 @@ def project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> Splats
     variance_x = ax[0] * ax[0] + ax[1] * ax[1] + ax[2] * ax[2] + config.eps2d
     variance_y = ay[0] * ay[0] + ay[1] * ay[1] + ay[2] * ay[2] + config.eps2d
     covariance = ax[0] * ay[0] + ax[1] * ay[1] + ax[2] * ay[2]
-    determinant = variance_x * variance_y - covariance * covariance
-    # Where float32 overflows or loses the determinant, the shape is unknown.
-    has_shape = (determinant > 0) & jnp.isfinite(determinant)
-    inverse = 1 / jnp.where(has_shape, determinant, 1.0)
+    bounded = (variance_x < _VARIANCE_MAX) & (variance_y < _VARIANCE_MAX)
+    # Lagrange's identity: the difference variance_x * variance_y - covariance^2 as a sum of squares, so that thin and
+    # large Gaussians do not lose it to rounding.
+    crosses = [ax[0] * ay[1] - ax[1] * ay[0], ax[1] * ay[2] - ax[2] * ay[1], ax[2] * ay[0] - ax[0] * ay[2]]
+    determinant = sum(c * c for c in crosses) + config.eps2d * (variance_x + variance_y - config.eps2d)
+    inverse = 1 / jnp.where(bounded, determinant, 1.0)
     return Splats(
         x=fx * slope_x + cx,
         y=fy * slope_y + cy,
@@ -84,22 +90,26 @@ def project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> Splats
         conic_yy=variance_x * inverse,
         variance_x=variance_x,
         variance_y=variance_y,
+        log_opacity=_log_opacities(jnp.where(finite, gaussians.logit_opacities, 0.0)),
         depth=depth,
-        valid=finite & in_front & has_shape,
-        finite=finite & (has_shape | ~in_front),
+        valid=finite & in_front & bounded,
+        finite=finite & (bounded | ~in_front),
     )
 
 
 def _finite(gaussians: Gaussians) -> Bool[Array, " n"]:
     """False for a Gaussian with a NaN or infinite parameter; an infinite logit is only an opacity of 0 or 1."""
-    columns = [gaussians.means[:, i] for i in range(3)]
-    columns += [gaussians.quats[:, i] for i in range(4)]
-    columns += [jnp.exp(gaussians.log_scales[:, i]) for i in range(3)]
-    columns += [gaussians.colors[:, i] for i in range(gaussians.colors.shape[1])]
+    # Reductions, though over three numbers: XLA computes them once, and not again in all that depends on them.
+    rows = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.colors)
     finite = ~jnp.isnan(gaussians.logit_opacities)
-    for column in columns:
-        finite &= jnp.isfinite(column)
+    for row in rows:
+        finite &= jnp.all(jnp.isfinite(row), axis=1)
     return finite
+
+
+def _log_opacities(logits: Float[Array, " n"]) -> Float[Array, " n"]:
+    # Several times as fast on CPU as log_sigmoid, whose care for very small opacities is lost below ALPHA_MIN.
+    return -jnp.log(1 + jnp.exp(-jnp.maximum(logits, -30.0)))
 
 
 def _masked_columns(x: Float[Array, "n 3"], keep: Bool[Array, " n"]) -> list[Float[Array, " n"]]:

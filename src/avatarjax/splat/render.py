@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
 from avatarjax.splat import tiles
-from avatarjax.splat.blend import blend, pack
+from avatarjax.splat.blend import blend, columns_of
 from avatarjax.splat.config import CAPACITY_MAX, SplatConfig, default_capacity
 from avatarjax.splat.project import project
 
@@ -98,10 +98,9 @@ def _render(gaussians: Gaussians, camera: Camera, background: Float[Array, 3], c
     grid = _grid(camera, config)
     capacity = config.capacity or default_capacity(len(gaussians), grid.tiles)
     splats = project(gaussians, camera, config)
-    log_opacities = jax.nn.log_sigmoid(gaussians.logit_opacities)
-    lists = tiles.bin_splats(splats, log_opacities, grid, capacity)
+    lists = tiles.bin_splats(splats, grid, capacity)
     channels = jnp.concatenate([gaussians.colors, splats.depth[:, None]], axis=1)
-    blended = grid.assemble(blend(pack(splats, log_opacities, channels), lists, grid, config))
+    blended = grid.assemble(blend(columns_of(splats, channels), lists, grid, config))
     colors, depth, transmittance = blended[..., :3], blended[..., 3], blended[..., 4]
     alpha = 1 - transmittance
     seen = alpha > 0
@@ -117,8 +116,7 @@ def _render(gaussians: Gaussians, camera: Camera, background: Float[Array, 3], c
 def _count(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> Int[Array, " v"]:
     def count(camera):
         splats = project(gaussians, camera, config)
-        log_opacities = jax.nn.log_sigmoid(gaussians.logit_opacities)
-        return tiles.count_intersections(splats, log_opacities, _grid(camera, config))
+        return tiles.count_intersections(splats, _grid(camera, config))
 
     return jax.lax.map(count, cameras)
 

@@ -81,32 +81,34 @@ class _Footprints(typing.NamedTuple):
     tiles: Int[Array, " n"]
 
 
-def bin_splats(splats: Splats, log_opacities: Float[Array, " n"], grid: TileGrid, capacity: int) -> TileLists:
+def bin_splats(splats: Splats, grid: TileGrid, capacity: int) -> TileLists:
     """Lists of the Gaussians that reach ALPHA_MIN within the bounding box of a tile. Not differentiable.
 
     Under `jax.vmap` the scenes are binned one after another.
     """
     binned = jax.custom_batching.sequential_vmap(functools.partial(_bin_splats, grid=grid, capacity=capacity))
-    return binned(*jax.lax.stop_gradient((splats, log_opacities)))
+    return binned(jax.lax.stop_gradient(splats))
 
 
-def count_intersections(splats: Splats, log_opacities: Float[Array, " n"], grid: TileGrid) -> Int[Array, ""]:
+def count_intersections(splats: Splats, grid: TileGrid) -> Int[Array, ""]:
     """Number of (Gaussian, tile) intersections, exact up to 2^24, at most 2^30."""
-    tiles = _footprints(splats, log_opacities, grid).tiles
+    tiles = _footprints(splats, grid).tiles
     return sorting.exclusive_sum(tiles)[-1] + tiles[-1]
 
 
-def _bin_splats(splats: Splats, log_opacities: Float[Array, " n"], *, grid: TileGrid, capacity: int) -> TileLists:
-    n = log_opacities.shape[0]
-    footprints = _footprints(splats, log_opacities, grid)
+def _bin_splats(splats: Splats, *, grid: TileGrid, capacity: int) -> TileLists:
+    n = splats.depth.shape[0]
+    footprints = _footprints(splats, grid)
     order = sorting.depth_order(splats.depth, footprints.tiles > 0)
-    first_tile, columns, tiles = jnp.stack(footprints, axis=1)[order].T
+    sorted_footprints = jnp.stack(footprints, axis=1)[order]
+    first_tile, columns, tiles = (sorted_footprints[:, k] for k in range(3))
     starts = sorting.exclusive_sum(tiles)
     total = starts[-1] + tiles[-1]
     # One list entry per intersection: mark where each Gaussian's entries start, and count marks to know whose they are.
     marks = jnp.zeros(capacity, jnp.int32).at[jnp.where(tiles > 0, starts, capacity)].add(1, mode="drop")
     owners = jnp.clip(sorting.exclusive_sum(marks) + marks - 1, 0, n - 1)
-    start, first_tile, columns, ids = jnp.stack([starts, first_tile, columns, order], axis=1)[owners].T
+    entry = jnp.stack([starts, first_tile, columns, order], axis=1)[owners]
+    start, first_tile, columns, ids = (entry[:, k] for k in range(4))
     entries = jnp.arange(capacity, dtype=jnp.int32)
     within = entries - start
     # Integer division is slow on CPU; the half keeps the rounding of the float quotient away from the integers.
@@ -117,17 +119,18 @@ def _bin_splats(splats: Splats, log_opacities: Float[Array, " n"], *, grid: Tile
     return TileLists(ids, starts, ends, total, jnp.maximum(total - capacity, 0))
 
 
-def _footprints(splats: Splats, log_opacities: Float[Array, " n"], grid: TileGrid) -> _Footprints:
+def _footprints(splats: Splats, grid: TileGrid) -> _Footprints:
     # alpha >= ALPHA_MIN inside an ellipse of this many standard deviations, squared.
-    reach = 2 * (log_opacities - math.log(ALPHA_MIN))
-    visible = splats.valid & (reach > 0)
-    radius = jnp.sqrt(jnp.maximum(reach, 0.0))
-    x0, x1 = _tile_range(splats.x, radius * jnp.sqrt(splats.variance_x), grid.tile_width, grid.columns)
-    y0, y1 = _tile_range(splats.y, radius * jnp.sqrt(splats.variance_y), grid.tile_height, grid.rows)
+    reach = jnp.where(splats.valid, 2 * (splats.log_opacity - math.log(ALPHA_MIN)), 0.0)
+    # Validity goes into the extents, and is read off them: XLA keeps square roots, but computes what is cheap, such as
+    # the whole projection, again for each gathered element.
+    extent_x, extent_y = (jnp.sqrt(jnp.maximum(reach, 0.0) * v) for v in (splats.variance_x, splats.variance_y))
+    x0, x1 = _tile_range(splats.x, extent_x, grid.tile_width, grid.columns)
+    y0, y1 = _tile_range(splats.y, extent_y, grid.tile_height, grid.rows)
     return _Footprints(
         first_tile=y0 * grid.columns + x0,
         columns=jnp.maximum(x1 - x0, 1),
-        tiles=jnp.where(visible, (x1 - x0) * (y1 - y0), 0),
+        tiles=jnp.where(extent_x > 0, (x1 - x0) * (y1 - y0), 0),
     )
 
 
