@@ -19,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from avatarjax.splat import columns
 from avatarjax.splat.config import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, SplatConfig
 from avatarjax.splat.project import Splats
 from avatarjax.splat.tiles import TileGrid, TileLists
@@ -28,23 +29,23 @@ _X, _Y, _XX, _XY, _YY, _LOG_OPACITY, _CHANNELS = range(7)
 _MIN_LANES = 16
 
 
-def columns_of(splats: Splats, channels: Float[Array, "n c"]) -> list[Float[Array, " n"]]:
+def fields_of(splats: Splats, channels: list[Float[Array, " n"]]) -> list[Float[Array, " n"]]:
     """What `blend` reads of n Gaussians; the conic with the factors of -(xx dx^2 + 2 xy dx dy + yy dy^2) / 2 in it."""
-    columns = [splats.x, splats.y, -0.5 * splats.conic_xx, -splats.conic_xy, -0.5 * splats.conic_yy, splats.log_opacity]
-    return columns + [channels[:, c] for c in range(channels.shape[1])]
+    conic = [-0.5 * splats.conic_xx, -splats.conic_xy, -0.5 * splats.conic_yy]
+    return [splats.x, splats.y, *conic, splats.log_opacity, *channels]
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def blend(
-    columns: list[Float[Array, " n"]], lists: TileLists, grid: TileGrid, config: SplatConfig
+    fields: list[Float[Array, " n"]], lists: TileLists, grid: TileGrid, config: SplatConfig
 ) -> Float[Array, "t c p"]:
-    """Blend the channels in `columns_of` over every tile; the last of the c results is the transmittance.
+    """Blend the channels in `fields_of` over every tile; the last of the c results is the transmittance.
 
-    Differentiable with respect to the columns. An entry counts from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is
+    Differentiable with respect to the fields. An entry counts from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is
     finished once no pixel of it lets more than TRANSMITTANCE_MIN through. Under `jax.vmap` the scenes are blended one
     after another.
     """
-    return _blend_table(_table(columns), lists, grid, config)
+    return _blend_table(_table(fields), lists, grid, config)
 
 
 def _blend_table(
@@ -55,8 +56,8 @@ def _blend_table(
     return jax.custom_batching.sequential_vmap(forward)(table, lists)
 
 
-def _blend_fwd(columns, lists, grid, config):
-    table = _table(columns)
+def _blend_fwd(fields, lists, grid, config):
+    table = _table(fields)
     blended = _blend_table(table, lists, grid, config)
     return blended, (table, lists, blended)
 
@@ -66,22 +67,16 @@ def _blend_bwd(grid, config, residuals, cotangent):
     lanes = _lanes(config.backward_lanes, grid)
     backward = functools.partial(_backward, grid=grid, lanes=lanes, steps=config.backward_steps)
     gradient = jax.custom_batching.sequential_vmap(backward)(table, lists, blended, cotangent)
-    return [gradient[:-1, k] for k in range(gradient.shape[1])], None
+    return columns.split(gradient[:-1]), None
 
 
 blend.defvjp(_blend_fwd, _blend_bwd)
 
 
-def _table(columns: list[Float[Array, " n"]]) -> Float[Array, "n+1 k"]:
-    """One row per Gaussian, which a lane reads at once, and a last row that is transparent.
-
-    Written column by column: a fused `jnp.stack` on CPU computes the projection again for every element.
-    """
-    n = columns[0].shape[0]
-    table = jnp.zeros((n + 1, len(columns)), jnp.float32).at[n, _LOG_OPACITY].set(-1e9)
-    for k, column in enumerate(columns):
-        table = table.at[:n, k].set(column)
-    return table
+def _table(fields: list[Float[Array, " n"]]) -> Float[Array, "n+1 k"]:
+    """One row per Gaussian, which a lane reads at once, and a last row that is transparent."""
+    rest = [jnp.pad(f, (0, 1), constant_values=-1e9 if k == _LOG_OPACITY else 0.0) for k, f in enumerate(fields)]
+    return columns.join(rest)
 
 
 def _lanes(most: int, grid: TileGrid) -> int:

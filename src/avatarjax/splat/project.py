@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from avatarjax import rotations
 from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
+from avatarjax.splat import columns
 from avatarjax.splat.config import SplatConfig
 
 # Square pixels. The determinant of larger covariances would come near the largest float32.
@@ -48,8 +49,8 @@ def project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> Splats
     """
     finite = _finite(gaussians)
     # Masked values go in, not only out: the gradient of a masked result is 0 * NaN otherwise.
-    x, y, z = _masked_columns(gaussians.means, finite)
-    scales = [jnp.exp(s) for s in _masked_columns(gaussians.log_scales, finite)]
+    x, y, z = (jnp.where(finite, x, 0.0) for x in columns.split(gaussians.means))
+    scales = [jnp.exp(jnp.where(finite, s, 0.0)) for s in columns.split(gaussians.log_scales)]
     quats = jnp.where(finite[:, None], gaussians.quats, jnp.ones_like(gaussians.quats))
 
     r, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
@@ -112,13 +113,8 @@ def _log_opacities(logits: Float[Array, " n"]) -> Float[Array, " n"]:
     return -jnp.log(1 + jnp.exp(-jnp.maximum(logits, -30.0)))
 
 
-def _masked_columns(x: Float[Array, "n 3"], keep: Bool[Array, " n"]) -> list[Float[Array, " n"]]:
-    return [jnp.where(keep, x[:, i], 0.0) for i in range(3)]
-
-
 def _rotation_columns(quats: Float[Array, "n 4"]) -> list[tuple[Float[Array, " n"], ...]]:
-    q = rotations.normalize(quats)
-    w, x, y, z = q[:, 0], q[:, 1], q[:, 2], q[:, 3]
+    w, x, y, z = columns.split(rotations.normalize(quats))
     return [
         (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),

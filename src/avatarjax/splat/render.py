@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, Int
 
 from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
-from avatarjax.splat import tiles
-from avatarjax.splat.blend import blend, columns_of
+from avatarjax.splat import columns, tiles
+from avatarjax.splat.blend import blend, fields_of
 from avatarjax.splat.config import CAPACITY_MAX, SplatConfig, default_capacity
 from avatarjax.splat.project import project
 
@@ -99,8 +99,8 @@ def _render(gaussians: Gaussians, camera: Camera, background: Float[Array, 3], c
     capacity = config.capacity or default_capacity(len(gaussians), grid.tiles)
     splats = project(gaussians, camera, config)
     lists = tiles.bin_splats(splats, grid, capacity)
-    channels = jnp.concatenate([gaussians.colors, splats.depth[:, None]], axis=1)
-    blended = grid.assemble(blend(columns_of(splats, channels), lists, grid, config))
+    channels = [*columns.split(gaussians.colors), splats.depth]
+    blended = grid.assemble(blend(fields_of(splats, channels), lists, grid, config))
     colors, depth, transmittance = blended[..., :3], blended[..., 3], blended[..., 4]
     alpha = 1 - transmittance
     seen = alpha > 0
