@@ -89,6 +89,13 @@ def read_rig(path: Path, groups: dict[str, list]) -> tuple[tuple[str, ...], tupl
     return tuple(n.split(":")[1] for n in order), parents, supports
 
 
+def mirrored(joints: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """Joints (j, ...) made symmetric in x: the rig's own collar bones rest on vertices that are no mirror images."""
+    swapped = [n.replace("Left", "~").replace("Right", "Left").replace("~", "Right") for n in names]
+    other = joints[[names.index(n) for n in swapped]] * np.array([-1.0, 1.0, 1.0])
+    return (joints + other) / 2
+
+
 def top_weights(path: Path, names: tuple[str, ...], used: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The four largest skinning weights of each used vertex: bone indices uint8 and weights uint16 of 65535."""
     dense = np.zeros((count, len(names)))
@@ -113,7 +120,7 @@ def build(config: Config) -> dict[str, np.ndarray]:
 
     def joints(points: np.ndarray) -> np.ndarray:
         # Heads and tails are means of vertices, so they are as linear in the targets as the vertices are.
-        return np.array([[points[end].mean(0) for end in bone] for bone in supports])
+        return mirrored(np.array([[points[end].mean(0) for end in bone] for bone in supports]), names)
 
     def metres(points: np.ndarray) -> np.ndarray:
         return np.round(points * 0.1 / body.QUANTUM).astype(np.int16)

@@ -143,7 +143,7 @@ def long_hair(
     margin: float = 0.014,
     columns: int = 56,
 ) -> Piece:
-    """Hair that falls from the head (h, 3) over the back and in two locks over the shoulders of the body (v, 3).
+    """Hair that falls from the head (h, 3) over the back of the body (v, 3).
 
     From height `top` to `ear` it follows the outline of the head, below it hangs, pushed out of the body, to `bottom`
     at the back. `spread` is the angle from the back to the front edges, radians.
@@ -161,24 +161,31 @@ def long_hair(
         reach = np.maximum(outline(slab, centre, angles) + margin, reach * 0.995)
         at = centre + np.stack([np.sin(angles), np.cos(angles)], axis=1) * (reach + strands)[:, None]
         rows.append(np.stack([at[:, 0], np.full(columns, y), at[:, 1]], axis=1))
+    # The upper edge is tucked under the hat.
+    axis = np.array([centre[0], 0.0, centre[1]])
+    rows.insert(0, axis + (rows[0] - axis) * np.array([0.7, 1.0, 0.7]) + np.array([0, 0.025, 0]))
     tree = cKDTree(body)
-    # Locks at the face are shorter, and no two end at the same height.
+    # The front edges are shorter, and no two strands end at the same height.
     front = smoothstep(np.abs(turn), 1.1, spread)
-    length = (ear - bottom) * (1 - 0.5 * front) * (1 + 0.05 * np.sin(turn * 9) + 0.04 * np.sin(turn * 17 + 2))
+    length = (ear - bottom) * (1 - 0.12 * front) * (1 + 0.05 * np.sin(turn * 9) + 0.04 * np.sin(turn * 17 + 2))
     count = 20
-    for _i in range(count):
+    for i in range(count):
         point = rows[-1].copy()
         point[:, 1] -= length / count
-        # Hair gathers behind the shoulders; the locks at the front come forward and inwards.
-        point[:, 0] *= 1 - 0.022 * (1 - 0.2 * front)
-        point[:, 2] += 0.0015 * (1 - front) + 0.002 * front
+        # Below the ears the hair is swept back, so that it falls behind the shoulders.
+        back = -turn * 0.09 * (i < 7)
+        x, z = point[:, 0] - centre[0], point[:, 2] - centre[1]
+        point[:, 0] = centre[0] + x * np.cos(back) + z * np.sin(back)
+        point[:, 2] = centre[1] - x * np.sin(back) + z * np.cos(back)
+        point[:, 0] *= 0.985
         for _ in range(4):
             _, nearest = tree.query(point, k=4)
             normal = normals[nearest].mean(1)
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
             depth = ((point - body[nearest].mean(1)) * normal).sum(1)
-            push = np.clip(margin - depth, 0, 0.05) * (depth > -0.12)
-            away = normal * np.array([1.0, 0.3, 1.0])
+            push = np.clip(margin + 0.02 * i / count - depth, 0, 0.05) * (depth > -0.12)
+            # On the shoulders too it slides off to the back.
+            away = np.stack([normal[:, 0], 0.3 * normal[:, 1], -np.abs(normal[:, 2]) - 0.3], axis=1)
             point += away * push[:, None]
         point[1:-1] = (point[:-2] + 2 * point[1:-1] + point[2:]) / 4
         rows.append(point)
@@ -189,4 +196,4 @@ def long_hair(
     weights = one_bone(rig, "Head", len(vertices)) * on_head[:, None]
     weights[:, rig.index("Spine2")] += 1 - on_head
     fall = np.clip((ear - vertices[:, 1]) / (ear - bottom), 0, 1)
-    return Piece("hair", vertices, faces, uvs, weights.astype(np.float32), (0.85 * fall**1.3).astype(np.float32))
+    return Piece("hair", vertices, faces, uvs, weights.astype(np.float32), (0.6 * fall**1.3).astype(np.float32))

@@ -21,7 +21,7 @@ _HEM = np.array([236.0, 220.0, 190.0])
 _BELT = np.array([78.0, 44.0, 26.0])
 _BRASS = np.array([214.0, 176.0, 88.0])
 _BOOT = np.array([112.0, 62.0, 34.0])
-_HAIR = np.array([204.0, 152.0, 82.0])
+_HAIR = np.array([196.0, 150.0, 90.0])
 _FELT = np.array([176.0, 132.0, 84.0])
 _SOLE = 0.012
 

@@ -13,11 +13,6 @@ _SKY, _GROUND, _LAMP = 0.80, 0.52, 0.34
 _LAMP_DIRECTION = np.array([0.45, 0.65, 0.62], np.float32) / np.linalg.norm([0.45, 0.65, 0.62])
 
 
-def triangle_uvs(uvs: Float[np.ndarray, "u 2"], uv_faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 2"]:
-    """Texture coordinates of each corner of each triangle."""
-    return uvs[uv_faces]
-
-
 def sample_texture(texture: UInt8[np.ndarray, "h w 3"], uvs: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     """Bilinear colours (n, 3) in 0..255 at texture coordinates (n, 2): u to the right, v up, clamped at the border."""
     height, width, _ = texture.shape
@@ -41,7 +36,7 @@ class MeshRenderer:
     def __init__(
         self,
         faces: Int[np.ndarray, "f 3"],
-        uvs: Float[np.ndarray, "f 3 2"],
+        uvs: Float[np.ndarray, "g 3 2"],
         texture: UInt8[np.ndarray, "h w 3"],
     ) -> None:
         if len(faces) == 0 or len(uvs) != len(faces):
