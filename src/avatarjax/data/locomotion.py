@@ -36,7 +36,7 @@ class LocomotionConfig:
 
     fps: float = 30.0
     directions: tuple[float, ...] = (0.0, math.pi, math.pi / 2, -math.pi / 2)
-    turn_frequency: float = 11.1
+    turn_frequency: float = 10.7
     speed_frequency: float = 10.0
     turn_slowdown: float = 0.45
     blend_frequency: float = 13.0

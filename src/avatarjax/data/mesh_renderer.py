@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import typing
+
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy import sparse
@@ -54,23 +57,39 @@ class MeshRenderer:
         normals = self._around @ np.cross(b - a, c - a)
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
+    def pose(self, vertices: Float[np.ndarray, "v 3"]) -> PosedMesh:
+        """The mesh in one pose, ready for any number of views. Raises ValueError for vertices that are not finite."""
+        vertices = np.ascontiguousarray(vertices, np.float32)
+        if not np.isfinite(vertices).all():
+            raise ValueError("the mesh has vertices that are not finite")
+        return PosedMesh(self, vertices, self.vertex_normals(vertices), _scene(vertices, self.faces))
+
     def render(
         self, vertices: Float[np.ndarray, "v 3"], camera: Camera, supersample: int = 2
     ) -> UInt8[np.ndarray, "h w 4"]:
-        """One view of the posed mesh as straight-alpha RGBA; `supersample` squared rays fall on a pixel.
+        """One view of one pose: `pose(vertices).render(camera, supersample)`."""
+        return self.pose(vertices).render(camera, supersample)
 
-        Raises ValueError for vertices that are not finite.
-        """
-        vertices = np.asarray(vertices, np.float32)
-        if not np.isfinite(vertices).all():
-            raise ValueError("the mesh has vertices that are not finite")
-        pixels, origin, directions = _rays(vertices, camera, supersample)
-        hits = _first_hits(vertices[self.faces], origin, directions)
-        struck = hits["primID"] >= 0
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PosedMesh:
+    """One pose of a mesh with its ray-casting structure: vertices and unit normals (v, 3)."""
+
+    renderer: MeshRenderer
+    vertices: Float[np.ndarray, "v 3"]
+    normals: Float[np.ndarray, "v 3"]
+    scene: typing.Any
+
+    def render(self, camera: Camera, supersample: int = 2) -> UInt8[np.ndarray, "h w 4"]:
+        """One view as straight-alpha RGBA; `supersample` squared rays fall on a pixel."""
+        renderer = self.renderer
+        pixels, origin, directions = _rays(self.vertices, camera, supersample)
+        hits = self.scene.run(np.tile(origin, (len(directions), 1)), directions, output=1)
+        struck = np.flatnonzero(hits["primID"] >= 0)
         face, u, v = hits["primID"][struck], hits["u"][struck], hits["v"][struck]
         bary = np.stack([1 - u - v, u, v], axis=1).astype(np.float32)
-        colour = sample_texture(self.texture, np.einsum("nc,ncd->nd", bary, self.uvs[face]))
-        normal = np.einsum("nc,ncd->nd", bary, self.vertex_normals(vertices)[self.faces[face]])
+        colour = sample_texture(renderer.texture, np.einsum("nc,ncd->nd", bary, renderer.uvs[face]))
+        normal = np.einsum("nc,ncd->nd", bary, self.normals[renderer.faces[face]])
         colour *= _light(normal, directions[struck])[:, None]
 
         width, height = camera.width, camera.height
@@ -98,20 +117,20 @@ def _rays(vertices: np.ndarray, camera: Camera, supersample: int) -> tuple[np.nd
     size = np.maximum(high - low, 0).astype(int) * supersample
     x = low[0] + (np.arange(size[0]) + 0.5) / supersample
     y = low[1] + (np.arange(size[1]) + 0.5) / supersample
-    grid = np.stack([*np.meshgrid(x, y), np.ones((size[1], size[0]))], axis=-1).reshape(-1, 3)
-    directions = grid @ np.linalg.inv(intrinsics).T @ rotation
-    pixels = np.floor(grid[:, 1]).astype(int) * camera.width + np.floor(grid[:, 0]).astype(int)
-    return pixels, -rotation.T @ shift, directions.astype(np.float32)
+    across, down, ahead = (np.linalg.inv(intrinsics).T @ rotation).astype(np.float32)
+    rows = y.astype(np.float32)[:, None] * down + ahead
+    directions = rows[:, None] + (x.astype(np.float32)[:, None] * across)[None]
+    pixels = np.floor(y).astype(int)[:, None] * camera.width + np.floor(x).astype(int)[None]
+    return pixels.ravel(), (-rotation.T @ shift).astype(np.float32), directions.reshape(-1, 3)
 
 
-def _first_hits(triangles: np.ndarray, origin: np.ndarray, directions: np.ndarray) -> dict[str, np.ndarray]:
+def _scene(vertices: np.ndarray, faces: np.ndarray) -> typing.Any:
     from embreex import rtcore_scene
     from embreex.mesh_construction import TriangleMesh
 
     scene = rtcore_scene.EmbreeScene()
-    TriangleMesh(scene, np.ascontiguousarray(triangles, np.float32))
-    origins = np.broadcast_to(origin.astype(np.float32), directions.shape)
-    return scene.run(np.ascontiguousarray(origins), directions, output=1)
+    TriangleMesh(scene, vertices, np.ascontiguousarray(faces, np.int32))
+    return scene
 
 
 def _light(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
