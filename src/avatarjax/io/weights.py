@@ -69,5 +69,17 @@ def load_tree(path: str | os.PathLike, template: PyTree) -> tuple[PyTree, dict[s
     return jax.tree_util.tree_unflatten(treedef, leaves), metadata
 
 
+def nest(arrays: dict[str, typing.Any]) -> dict[str | int, typing.Any]:
+    """Arrays by path as nested dicts; path parts that are whole numbers become integer keys, as in Flax lists."""
+    tree: dict[str | int, typing.Any] = {}
+    for name, value in arrays.items():
+        *parents, last = (int(part) if part.isdigit() else part for part in name.split("/"))
+        node = tree
+        for part in parents:
+            node = node.setdefault(part, {})
+        node[last] = value
+    return tree
+
+
 def _is_key(leaf: typing.Any) -> bool:
     return hasattr(leaf, "dtype") and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)

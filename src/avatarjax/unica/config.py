@@ -169,7 +169,7 @@ def _ci() -> UnicaConfig:
             offset_bound=0.05,
         ),
         views_per_step=4,
-        vae_stage=StageConfig(1_200, 32, 2e-3),
+        vae_stage=StageConfig(1_200, 16, 2e-3),
         unet1_stage=StageConfig(300, 16, 1e-3),
         unet2_stage=StageConfig(700, 16, 1e-3),
         coefficients_stage=StageConfig(4_000, 128, 2e-3, ema=0.998),

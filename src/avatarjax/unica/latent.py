@@ -18,7 +18,6 @@ from avatarjax.unica.denoiser import Denoiser, DenoiserConfig
 from avatarjax.unica.vae import VAE, VAEConfig, kl_divergence, sample_latent
 
 CONTEXT = 3
-BACKGROUND = 0.5  # ours; zero after scaling to [-1, 1]. The public files have 0, the released code also 0.5 and -1.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,41 +38,52 @@ class LatentConfig:
 @typing.no_type_check
 @flax.struct.dataclass
 class LatentDynamics:
-    """Trained weights: autoencoder, UNet, and the mean and standard deviation (l,) that bring latents to unit size."""
+    """Trained weights of autoencoder and UNet, and the statistics that bring maps and latents to unit size.
+
+    map_mean (t, 3) and map_scale () of normalised texels; latent_mean, latent_scale (l,).
+    """
 
     vae: Params
     denoiser: Params
+    map_mean: Float[Array, "t 3"]
+    map_scale: Float[Array, ""]
     latent_mean: Float[Array, "l"]
     latent_scale: Float[Array, "l"]
 
 
-def to_images(atlas: Atlas, texels: Float[Array, "b t 3"]) -> Float[Array, "b h w 3"]:
-    """Normalised texels as maps in [-1, 1] with a background of 0, the autoencoder's input."""
-    return jax.vmap(lambda x: 2 * posmap.to_map(atlas, x, BACKGROUND) - 1)(texels)
+def to_images(atlas: Atlas, dynamics: LatentDynamics, texels: Float[Array, "b t 3"]) -> Float[Array, "b h w 3"]:
+    """Normalised texels as the autoencoder's input: their deviation from the mean map, of unit size, background 0.
+
+    The deviation is ours: the mean map is the same in every frame, and a network that must also paint it, with its
+    silhouette against the background, spends most of its training on that.
+    """
+    deviation = (texels - dynamics.map_mean[None]) / dynamics.map_scale
+    return jax.vmap(lambda x: posmap.to_map(atlas, x))(deviation)
 
 
-def from_images(atlas: Atlas, images: Float[Array, "b h w 3"]) -> Float[Array, "b t 3"]:
+def from_images(atlas: Atlas, dynamics: LatentDynamics, images: Float[Array, "b h w 3"]) -> Float[Array, "b t 3"]:
     """The inverse of `to_images` on the foreground."""
-    return jax.vmap(lambda x: posmap.from_map(atlas, x) / 2 + 0.5)(images)
+    deviation = jax.vmap(lambda x: posmap.from_map(atlas, x))(images)
+    return deviation * dynamics.map_scale + dynamics.map_mean[None]
 
 
 def vae_loss(
-    config: LatentConfig, atlas: Atlas, params: Params, key: Key[Array, ""], texels: Float[Array, "b t 3"]
+    config: LatentConfig, atlas: Atlas, dynamics: LatentDynamics, key: Key[Array, ""], texels: Float[Array, "b t 3"]
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Reconstruction on the foreground plus weighted KL divergence (UNICA 3.6), and the error in normalised units."""
-    vae = bind(VAE, config.vae, params)
-    mean, log_variance = vae.encode(to_images(atlas, texels))
-    decoded = from_images(atlas, vae.decode(sample_latent(mean, log_variance, key)))
-    reconstruction = jnp.mean((2 * (decoded - texels)) ** 2)
+    vae = bind(VAE, config.vae, dynamics.vae)
+    mean, log_variance = vae.encode(to_images(atlas, dynamics, texels))
+    decoded = from_images(atlas, dynamics, vae.decode(sample_latent(mean, log_variance, key)))
+    squared = jnp.mean((decoded - texels) ** 2)
     kl = kl_divergence(mean, log_variance)
-    return reconstruction + config.kl_weight * kl, {"rmse": jnp.sqrt(reconstruction) / 2, "kl": kl}
+    return squared / dynamics.map_scale**2 + config.kl_weight * kl, {"rmse": jnp.sqrt(squared), "kl": kl}
 
 
 def encode(
     config: LatentConfig, atlas: Atlas, dynamics: LatentDynamics, texels: Float[Array, "b t 3"]
 ) -> Float[Array, "b u v l"]:
     """Latent means of unit size."""
-    mean, _ = bind(VAE, config.vae, dynamics.vae).encode(to_images(atlas, texels))
+    mean, _ = bind(VAE, config.vae, dynamics.vae).encode(to_images(atlas, dynamics, texels))
     shape = (1, 1, 1, -1)
     return (mean - dynamics.latent_mean.reshape(shape)) / dynamics.latent_scale.reshape(shape)
 
@@ -84,7 +94,7 @@ def decode(
     """Normalised texels of unit-size latents."""
     shape = (1, 1, 1, -1)
     latents = latents * dynamics.latent_scale.reshape(shape) + dynamics.latent_mean.reshape(shape)
-    return from_images(atlas, bind(VAE, config.vae, dynamics.vae).decode(latents))
+    return from_images(atlas, dynamics, bind(VAE, config.vae, dynamics.vae).decode(latents))
 
 
 def diffusion_loss(

@@ -1,0 +1,96 @@
+"""Trained avatars as files: one safetensors file with every array, its config in the header."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import typing
+from pathlib import Path
+
+import jax.numpy as jnp
+
+from avatarjax.io import weights
+from avatarjax.posmap import Atlas, Upscaler
+from avatarjax.posmap.pca import PCA
+from avatarjax.unica.appearance import BaseAttributes
+from avatarjax.unica.coefficients import CoefficientDynamics, Scaling
+from avatarjax.unica.config import PRESETS, DynamicsName, UnicaConfig
+from avatarjax.unica.latent import LatentDynamics
+from avatarjax.unica.rollout import Avatar
+
+VERSION = 1
+
+
+def file_name(dynamics: str) -> str:
+    """Name of an avatar's file inside a run folder."""
+    return f"avatar-{dynamics}.safetensors"
+
+
+def save(path: str | os.PathLike, avatar: Avatar) -> None:
+    """Write an avatar atomically."""
+    weights.save_tree(path, avatar, version=VERSION, config=dataclasses.asdict(avatar.config))
+
+
+def load(
+    source: str | os.PathLike, *, dynamics: DynamicsName | None = None, runs: str | os.PathLike = "runs"
+) -> Avatar:
+    """A trained avatar from a file, a run folder, or by name from the folders that `experiments.unica` wrote.
+
+    By name, presets are searched from the largest to the smallest under `runs`/unica/NAME/. `dynamics` asks for one of
+    the two models; otherwise the coefficient model is taken where a run has both. Raises ValueError where nothing is
+    there, with the command that trains it, and for files that are damaged or of another version.
+    """
+    path = Path(source)
+    if path.is_file():
+        return _read(path)
+    folders = [path]
+    if path.name == str(source):
+        folders += [Path(runs) / "unica" / path.name / preset for preset in reversed(PRESETS)]
+    for folder in folders:
+        for name in (dynamics,) if dynamics else typing.get_args(DynamicsName):
+            if (folder / file_name(name)).is_file():
+                return _read(folder / file_name(name))
+    raise ValueError(
+        f"no trained avatar {str(source)!r}: neither a file, nor a run folder, nor under {Path(runs) / 'unica'}. "
+        f"Train it with: python -m experiments.unica --avatar {path.name}"
+    )
+
+
+def _read(path: Path) -> Avatar:
+    arrays, metadata = weights.load_arrays(path)
+    if metadata.get("version") != VERSION:
+        raise ValueError(f"{path} holds no avatar of version {VERSION}: train it again")
+    try:
+        config = from_dict(UnicaConfig, metadata["config"])
+        tree = weights.nest({name: jnp.asarray(value) for name, value in arrays.items()})
+        dynamics = tree["dynamics"]
+        if "vae" in dynamics:
+            dynamics = LatentDynamics(**dynamics)
+        else:
+            dynamics = dynamics | {"basis": PCA(**dynamics["basis"]), "scaling": Scaling(**dynamics["scaling"])}
+            dynamics = CoefficientDynamics(**dynamics)
+        return Avatar(
+            atlas=Atlas(**tree["atlas"], size=config.size),
+            upscaler=Upscaler(**tree["upscaler"], size=config.upscaled),
+            pca=PCA(**tree["pca"]),
+            base=BaseAttributes(**tree["base"]),
+            appearance=tree["appearance"],
+            dynamics=dynamics,
+            standing=tree["standing"],
+            config=config,
+        )
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} lacks parts of an avatar ({error}): train it again") from error
+
+
+def from_dict(cls: type, values: dict[str, typing.Any]) -> typing.Any:
+    """A (nested) config dataclass from the JSON form of `dataclasses.asdict`."""
+    hints = typing.get_type_hints(cls)
+    fields = {}
+    for name, value in values.items():
+        if dataclasses.is_dataclass(hints[name]):
+            value = from_dict(hints[name], value)
+        elif isinstance(value, list):
+            value = tuple(value)
+        fields[name] = value
+    return cls(**fields)

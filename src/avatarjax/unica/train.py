@@ -1,0 +1,389 @@
+"""The trained stages of UNICA (3.6, B.1, C.2), each one jitted step inside the common loop.
+
+Every function takes the config, the dataset and a `Run` (where checkpoints go, and the seed), resumes what it finds there,
+and returns plain arrays. Weights that a stage does not train travel with the batch: closed over, they would be compiled
+in as constants.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import typing
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from avatarjax import posmap
+from avatarjax.cameras import Camera
+from avatarjax.data.dataset import Dataset, Images, cylinder_cameras
+from avatarjax.nets import functional
+from avatarjax.nets.functional import Params
+from avatarjax.posmap import pca as pcs
+from avatarjax.splat import SplatConfig, render, required_capacity
+from avatarjax.splat.losses import l1, ssim
+from avatarjax.train import TrainState, fit, make_step, new_state, weights
+from avatarjax.train.state import Loss, optimiser
+from avatarjax.unica import align, appearance, batches, coefficients, latent
+from avatarjax.unica import fit as closed_form
+from avatarjax.unica.coefficients import CoefficientDenoiser, CoefficientDynamics, Context
+from avatarjax.unica.config import StageConfig, UnicaConfig
+from avatarjax.unica.denoiser import Denoiser
+from avatarjax.unica.latent import LatentDynamics
+from avatarjax.unica.vae import VAE
+
+STEADY_ROLLOUT_SHARE = 0.3  # of the coefficient stage, before rollout training joins
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Where a run keeps its checkpoints, its seed, and the fingerprint of its data."""
+
+    folder: Path
+    seed: int
+    data: str
+
+    def key(self, stage: str) -> jax.Array:
+        """The PRNG key of a stage: every stage has its own, whatever ran before it."""
+        return jax.random.fold_in(jax.random.key(self.seed), int(hashlib.sha256(stage.encode()).hexdigest()[:7], 16))
+
+
+def _train(
+    run: Run,
+    name: str,
+    stage: StageConfig,
+    config: typing.Any,
+    loss: Loss,
+    initial: Params,
+    batch_at: typing.Callable[[int], typing.Any],
+) -> Params:
+    transform = optimiser(stage.learning_rate, stage.steps)
+    state: TrainState = new_state(initial, transform, run.key(name), averaged=stage.ema > 0)
+    step = make_step(loss, transform, decay=stage.ema)
+    mark = hashlib.sha256(f"{run.data} {run.seed} {stage} {config}".encode()).hexdigest()[:12]
+    return weights(fit(step, state, batch_at, stage.steps, run.folder, name, fingerprint=mark))
+
+
+def new_latent_dynamics(config: UnicaConfig, data: Dataset, run: Run) -> LatentDynamics:
+    """Untrained autoencoder and UNet, with the statistics of the maps."""
+    groups = _sample_groups(config, data, 256)
+    mean = groups.mean((0, 1))
+    width = config.latent.vae.latent_channels
+    return LatentDynamics(
+        vae=functional.init(VAE, config.latent.vae, run.key("vae")),
+        denoiser=functional.init(Denoiser, config.latent.denoiser, run.key("unet")),
+        map_mean=jnp.asarray(mean),
+        map_scale=jnp.asarray((groups - mean).std()),
+        latent_mean=jnp.zeros(width),
+        latent_scale=jnp.ones(width),
+    )
+
+
+def _sample_groups(config: UnicaConfig, data: Dataset, count: int) -> np.ndarray:
+    """Evenly spaced training groups (count, 4, t, 3) in normalised space."""
+    windows = batches.windows(data.train, 4, config.turn_window)
+    chosen = np.linspace(0, len(windows.first) - 1, min(count, len(windows.first))).astype(int)
+    return windows.groups(chosen, float(data.atlas.scale))[0]
+
+
+def train_vae(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamics) -> LatentDynamics:
+    """The autoencoder, on the frames of random groups: each frame at the four places it takes in them.
+
+    Returns the dynamics with the trained autoencoder and the statistics of its latents.
+    """
+    windows = batches.windows(data.train, 4, config.turn_window)
+    scale = float(data.atlas.scale)
+    stage = config.vae_stage
+
+    def batch_at(step):
+        rng = batches.generator(run.seed, step)
+        groups, _ = windows.groups(rng.integers(0, len(windows.first), stage.batch), scale)
+        texels = groups[np.arange(stage.batch), rng.integers(0, 4, stage.batch)]
+        return {"atlas": data.atlas, "frozen": start.replace(vae={}, denoiser={}), "texels": texels}
+
+    def loss(params, key, batch):
+        dynamics = batch["frozen"].replace(vae=params)
+        return latent.vae_loss(config.latent, batch["atlas"], dynamics, key, batch["texels"])
+
+    trained = start.replace(vae=_train(run, "vae", stage, config.latent, loss, start.vae, batch_at))
+    groups = _sample_groups(config, data, 64)
+    encode = jax.jit(functools.partial(latent.encode, config.latent))
+    mean, spread = closed_form.latent_statistics(encode(data.atlas, trained, groups.reshape(-1, *groups.shape[2:])))
+    return trained.replace(latent_mean=mean, latent_scale=spread)
+
+
+def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamics, number: int) -> LatentDynamics:
+    """Diffusion training, stage 1 or 2 (UNICA 3.6).
+
+    Stage 1 learns action embeddings and UNet on steady movement only. Stage 2 freezes the embeddings and draws 70 % of
+    its groups from the frames after a turning point.
+    """
+    windows = batches.windows(data.train, 4, config.turn_window)
+    scale = float(data.atlas.scale)
+    stage = config.unet1_stage if number == 1 else config.unet2_stage
+    fraction = 0.0 if number == 1 else config.turn_fraction
+    allowed = ~windows.turning if number == 1 else np.ones_like(windows.turning)
+
+    def batch_at(step):
+        rng = batches.generator(run.seed, step)
+        chosen = batches.draw(allowed, windows.turning, fraction, stage.batch, rng)
+        groups, actions = windows.groups(chosen, scale)
+        return {"atlas": data.atlas, "frozen": start.replace(denoiser={}), "groups": groups, "actions": actions}
+
+    def loss(params, key, batch):
+        if number == 2:
+            params = {**params, "action_table": jax.lax.stop_gradient(params["action_table"])}
+        dynamics = batch["frozen"].replace(denoiser=params)
+        return latent.diffusion_loss(config.latent, batch["atlas"], dynamics, key, batch["groups"], batch["actions"]), {}
+
+    trained = _train(run, f"unet{number}", stage, config.latent, loss, start.denoiser, batch_at)
+    return start.replace(denoiser=trained)
+
+
+def coefficient_frames(data: Dataset, recording: typing.Any) -> tuple[np.ndarray, np.ndarray]:
+    """Canonical vectors (f, 3t) and roots (f, 3) of a recording, headings unwrapped along each sequence."""
+    world = jnp.asarray(recording.texels + recording.roots[:, None])
+    flat, roots = jax.jit(jax.vmap(lambda x: coefficients.canonical(data.atlas, x)))(world)
+    roots = np.array(roots)
+    for sequence in np.unique(recording.sequence):
+        rows = recording.sequence == sequence
+        roots[rows, 2] = np.unwrap(roots[rows, 2])
+    return np.asarray(flat), roots
+
+
+def train_coefficients(config: UnicaConfig, data: Dataset, run: Run) -> CoefficientDynamics:
+    """The coefficient model: closed-form fits, denoising steps, and after 30 % of them also rollout training."""
+    settings, stage = config.coefficients, config.coefficients_stage
+    flat, roots = coefficient_frames(data, data.train)
+    basis = pcs.fit(jnp.asarray(flat), settings.components, run.key("coefficient basis"))
+    poses = np.asarray(pcs.project(basis, jnp.asarray(flat)))
+    yaw, moves = closed_form.action_directions(roots, data.train.actions, data.train.sequence, config.actions)
+    start = CoefficientDynamics(
+        params=functional.init(CoefficientDenoiser, settings, run.key("coefficients")),
+        basis=basis,
+        scaling=closed_form.coefficient_scaling(poses, roots, data.train.sequence),
+        action_yaw=jnp.asarray(yaw, jnp.float32),
+        action_moves=jnp.asarray(moves, jnp.float32),
+    )
+    single = batches.windows(data.train, 4, config.turn_window)
+    long = batches.windows(data.train, 3 + settings.rollout_frames, config.turn_window)
+    # A long window is worth oversampling when the turn is in its middle.
+    middle = batches.windows(data.train, 4, config.turn_window).turning
+    turning_at = np.zeros(len(data.train.actions), bool)
+    turning_at[single.first + 3] = middle
+    long_turning = turning_at[long.first + 3 + settings.rollout_frames // 2]
+
+    everything = single.frames(np.arange(len(single.first)))
+    linear = closed_form.ridge_start(
+        settings,
+        start,
+        Context(jnp.asarray(poses[everything[:, :3]]), jnp.asarray(roots[everything[:, :3]])),
+        jnp.asarray(poses[everything[:, 3]]),
+        jnp.asarray(roots[everything[:, 3]]),
+        run.key("ridge"),
+    )
+
+    def windows_at(windows, turning, count, rng):
+        chosen = batches.draw(np.ones_like(turning), turning, config.turn_fraction, count, rng)
+        frames = windows.frames(chosen)
+        # Positions start at the origin: far from it, float32 would round a step away.
+        ground = np.append(roots[frames[:, 2], :2], np.zeros((count, 1), np.float32), axis=1)
+        actions = data.train.actions[frames[:, 2:-1]]
+        return {"poses": poses[frames], "roots": roots[frames] - ground[:, None], "actions": actions}
+
+    def batch_at(step):
+        rng = batches.generator(run.seed, step)
+        return {
+            "frozen": start.replace(params={}),
+            "single": windows_at(single, single.turning, stage.batch, rng),
+            "long": windows_at(long, long_turning, max(1, stage.batch // 8), rng),
+            "rolling": np.bool_(step >= STEADY_ROLLOUT_SHARE * stage.steps),
+        }
+
+    def loss(params, key, batch):
+        dynamics = batch["frozen"].replace(params=params)
+        noise_key, one_key, roll_key = jax.random.split(key, 3)
+        one, many = batch["single"], batch["long"]
+        context, level = coefficients.noised_context(
+            settings, dynamics.scaling, noise_key, Context(one["poses"][:, :3], one["roots"][:, :3])
+        )
+        single_loss = coefficients.denoising_loss(
+            settings,
+            dynamics,
+            one_key,
+            context,
+            level,
+            one["poses"][:, 3],
+            one["roots"][:, 3],
+            one["actions"][:, 0],
+        )
+
+        def rolled(_):
+            return coefficients.rollout_loss(
+                settings,
+                dynamics,
+                roll_key,
+                Context(many["poses"][:, :3], many["roots"][:, :3]),
+                many["poses"][:, 3:],
+                many["roots"][:, 3:],
+                many["actions"],
+            )
+
+        roll_loss = jax.lax.cond(batch["rolling"], rolled, lambda _: single_loss, None)
+        return 0.5 * (single_loss + roll_loss), {"single": single_loss, "rollout": roll_loss}
+
+    params = _train(run, "coefficients", stage, settings, loss, linear, batch_at)
+    return start.replace(params=params)
+
+
+def fit_alignment(config: UnicaConfig, data: Dataset, run: Run) -> pcs.PCA:
+    """The PCA of normalised fourth maps (UNICA B.2)."""
+    windows = batches.windows(data.train, 4, config.turn_window)
+    frames = windows.frames(np.arange(len(windows.first)))
+    shift = data.train.roots[frames[:, 3]] - data.train.roots[frames[:, 2]]
+    fourth = batches.frame_images(data.train.texels[frames[:, 3]], shift, float(data.atlas.scale))
+    return closed_form.alignment_basis(jnp.asarray(fourth), config.pca_components, run.key("pca"))
+
+
+def boxed_points(
+    upscaler: posmap.Upscaler, texels: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Upscaled points (n, 3) of a pose in its box, and the box' side in the texels' unit (UNICA B.1)."""
+    points = posmap.upscale(upscaler, texels)
+    box = align.bounding_box(points)
+    return align.into_box(box, points), box.side
+
+
+def photometric_loss(
+    config: UnicaConfig, gaussians: typing.Any, views: Camera, rgba: jax.Array, white: jax.Array, splat: SplatConfig
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """L1 and SSIM of renders (k views) against straight-alpha uint8 RGBA over black or white (UNICA B.1, C.2).
+
+    `white` () is 0 or 1: alternating backgrounds keep black Gaussians from hiding in front of a black one.
+    """
+    target = rgba.astype(jnp.float32) / 255
+    target = target[..., :3] * target[..., 3:] + white * (1 - target[..., 3:])
+
+    def one(inputs):
+        camera, truth = inputs
+        out = render(gaussians, camera, background=white, config=splat)
+        squared = jnp.mean((jnp.clip(out.image, 0, 1) - truth) ** 2)
+        return l1(out.image, truth), ssim(out.image, truth), squared, out.info.dropped
+
+    absolute, similarity, squared, dropped = jax.lax.map(one, (views, target))
+    loss = config.loss_l1 * jnp.mean(absolute) + config.loss_ssim * (1 - jnp.mean(similarity))
+    psnr = -10 * jnp.mean(jnp.log10(jnp.maximum(squared, 1e-10)))
+    return loss, {"psnr": psnr, "dropped": jnp.sum(dropped).astype(jnp.float32)}
+
+
+def _pick(cameras: Camera, views: np.ndarray) -> Camera:
+    return jax.tree.map(lambda x: x[views], cameras)
+
+
+def _splat_config(gaussians: typing.Any, cameras: Camera) -> SplatConfig:
+    """Room for three times what the cloud needs before training: its Gaussians will grow."""
+    return SplatConfig(capacity=min(2**24, 3 * required_capacity(gaussians, cameras)))
+
+
+def train_base(config: UnicaConfig, data: Dataset, run: Run, upscaler: posmap.Upscaler) -> appearance.BaseAttributes:
+    """The base attribute map on the standing pose's 50 views, with frozen means (UNICA B.1)."""
+    stage, images = config.base_stage, data.standing_images
+    cameras = cylinder_cameras(images.rgba.shape[-2])
+    points, side = boxed_points(upscaler, jnp.asarray(images.texels[0]))
+    start = appearance.initial_base(points, side)
+    splat = _splat_config(appearance.coarse_gaussians(start, points, side), cameras)
+
+    def batch_at(step):
+        rng = batches.generator(run.seed, step)
+        slots = rng.choice(images.view.shape[1], min(stage.batch, images.view.shape[1]), replace=False)
+        return {
+            "points": points,
+            "height": side,
+            "views": _pick(cameras, images.view[0, slots]),
+            "rgba": images.rgba[0, slots],
+            "white": np.float32(rng.integers(2)),
+        }
+
+    def loss(params, key, batch):
+        base = appearance.BaseAttributes(**params, height=batch["height"])
+        cloud = appearance.coarse_gaussians(base, batch["points"], batch["height"])
+        return photometric_loss(config, cloud, batch["views"], batch["rgba"], batch["white"], splat)
+
+    initial = {name: getattr(start, name) for name in ("log_scales", "quats", "logit_opacities", "colors")}
+    trained = _train(run, "base", stage, config.appearance, loss, initial, batch_at)
+    return start.replace(**trained)
+
+
+def train_appearance(
+    config: UnicaConfig, data: Dataset, run: Run, upscaler: posmap.Upscaler, base: appearance.BaseAttributes
+) -> Params:
+    """The point transformer on training poses and random views of each (UNICA B.1, C.2)."""
+    stage, images = config.appearance_stage, data.train_images
+    cameras = cylinder_cameras(images.rgba.shape[-2])
+    points, side = boxed_points(upscaler, jnp.asarray(images.texels[0]))
+    splat = _splat_config(appearance.coarse_gaussians(base, points, side), cameras)
+    k = min(config.views_per_step, images.view.shape[1])
+
+    def batch_at(step):
+        rng = batches.generator(run.seed, step)
+        poses = rng.choice(len(images.texels), stage.batch, replace=len(images.texels) < stage.batch)
+        slots = np.stack([rng.permutation(images.view.shape[1])[:k] for _ in poses])
+        return {
+            "upscaler": upscaler,
+            "base": base,
+            "texels": images.texels[poses],
+            "views": _pick(cameras, images.view[poses[:, None], slots]),
+            "rgba": images.rgba[poses[:, None], slots],
+            "white": rng.integers(0, 2, stage.batch).astype(np.float32),
+        }
+
+    def loss(params, key, batch):
+        def one(pose):
+            texels, views, rgba, white = pose
+            points, side = boxed_points(batch["upscaler"], texels)
+            coarse = appearance.coarse_gaussians(batch["base"], points, side)
+            refined = appearance.refine(config.appearance, params, coarse)
+            return photometric_loss(config, refined, views, rgba, white, splat)
+
+        poses = (batch["texels"], batch["views"], batch["rgba"], batch["white"])
+        value, metrics = jax.lax.map(one, poses)
+        return jnp.mean(value), jax.tree.map(jnp.mean, metrics)
+
+    initial = functional.init(appearance.AppearanceNetwork, config.appearance, run.key("appearance"))
+    return _train(run, "appearance", stage, config.appearance, loss, initial, batch_at)
+
+
+def image_psnr(
+    config: UnicaConfig,
+    images: Images,
+    upscaler: posmap.Upscaler,
+    base: appearance.BaseAttributes,
+    params: Params | None,
+) -> np.ndarray:
+    """PSNR (p, k) in dB of each picture over black, with the appearance network or, for None, with base attributes."""
+    cameras = cylinder_cameras(images.rgba.shape[-2])
+    points, side = boxed_points(upscaler, jnp.asarray(images.texels[0]))
+    splat = _splat_config(appearance.coarse_gaussians(base, points, side), cameras)
+
+    @jax.jit
+    def one(upscaler, base, params, texels, views, rgba):
+        points, side = boxed_points(upscaler, texels)
+        cloud = appearance.coarse_gaussians(base, points, side)
+        if params is not None:
+            cloud = appearance.refine(config.appearance, params, cloud)
+
+        def view(inputs):
+            camera, truth = inputs
+            return photometric_loss(config, cloud, jax.tree.map(lambda x: x[None], camera), truth[None], 0.0, splat)[1]
+
+        return jax.lax.map(view, (views, rgba))["psnr"]
+
+    return np.stack(
+        [
+            np.asarray(one(upscaler, base, params, images.texels[p], _pick(cameras, images.view[p]), images.rgba[p]))
+            for p in range(len(images.texels))
+        ]
+    )
