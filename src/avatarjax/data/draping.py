@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 from avatarjax.data import skinning
 from avatarjax.data.garments import Drape
 
-# A vertex above the leg that is further back gives way to the other leg only beyond this distance from the middle.
-_SHARE_SHIFT, _SHARE_WIDTH, _SHARE_REACH = 0.07, 0.03, 0.06
+# Metres: how far past the middle the leading leg takes the cloth, the width of the change from one leg to the other and
+# what is added to it where no leg leads, and the lead at which it takes over.
+_SHARE_SHIFT, _SHARE_WIDTH, _SHARE_SPREAD, _SHARE_REACH = 0.07, 0.03, 0.06, 0.08
 
 
 @typing.no_type_check
@@ -49,7 +50,10 @@ def drape(
     out along `outward`.
     """
     ahead = jnp.sum(outward * (left - right), axis=-1)
-    share = jax.nn.sigmoid((side + _SHARE_SHIFT * jnp.tanh(ahead / _SHARE_REACH)) / _SHARE_WIDTH)[:, None]
+    lead = jnp.tanh(ahead / _SHARE_REACH)
+    # Side by side the legs share the cloth between them; the further one leads, the sharper it takes over.
+    width = _SHARE_WIDTH + _SHARE_SPREAD * (1 - lead * lead)
+    share = jax.nn.sigmoid((side + _SHARE_SHIFT * lead) / width)[:, None]
     return left * share + right * (1 - share)
 
 
