@@ -1,7 +1,7 @@
 """One avatar's training data in a folder: built once, checked when it is read, never half there.
 
-The manifest is written last and lists every file's size and SHA-256: a folder without one is unfinished, a file that does
-not fit it is named.
+The manifest is written last and lists every file's size and SHA-256: a folder without one is unfinished, and a file
+that does not fit it is named.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ class DatasetSpec:
 
     def __post_init__(self):
         if not 1 <= self.image_views <= VIEWS or not 1 <= self.standing_views <= VIEWS:
-            raise ValueError(f"there are 1 to {VIEWS} views a pose, asked for {self.image_views} and {self.standing_views}")
+            raise ValueError(
+                f"there are 1 to {VIEWS} views a pose, asked for {self.image_views} and {self.standing_views}"
+            )
 
 
 @typing.no_type_check
@@ -158,9 +160,10 @@ class _Painter:
             points = np.asarray(self.points(jnp.asarray(texels[k])))
             low, high = points.min(0), points.max(0)
             boxed = (vertices(k) - (low + high) / 2) / (high - low).max()
+            posed = self.renderer.pose(boxed.astype(np.float32))
             for slot, view in enumerate(views[k]):
                 camera = jax.tree.map(lambda x, v=view: x[v], self.cameras)
-                rgba[k, slot] = self.renderer.render(boxed.astype(np.float32), camera)
+                rgba[k, slot] = posed.render(camera)
 
         with concurrent.futures.ThreadPoolExecutor() as pool:
             done = pool.map(one, range(poses))

@@ -36,8 +36,8 @@ class Recording:
 def transition_scripts(frames: int, seed: int, actions: int = len(ACTIONS)) -> Int[np.ndarray, "n f"]:
     """All ordered pairs of different actions, a sequence each (UNICA A): the source for about a third, then the target.
 
-    The turning point varies by up to a twelfth of the sequence's length, so that it meets the gait in many phases. Raises
-    ValueError where a sequence is too short to hold a turn.
+    The turning point varies by up to a twelfth of the sequence's length, so that it meets the gait in many phases.
+    Raises ValueError where a sequence is too short to hold a turn.
     """
     if frames < 60:
         raise ValueError(f"a transition needs at least 60 frames to settle before and after the turn, got {frames}")
@@ -51,9 +51,7 @@ def transition_scripts(frames: int, seed: int, actions: int = len(ACTIONS)) -> I
     return np.asarray(scripts, np.int32)
 
 
-def simulate(
-    avatar: AvatarMesh, plans: dict[str, Int[np.ndarray, "_n _f"]], seed: int
-) -> dict[str, Motion]:
+def simulate(avatar: AvatarMesh, plans: dict[str, Int[np.ndarray, "_n _f"]], seed: int) -> dict[str, Motion]:
     """The controller's motion under each plan's scripts (n, f), with leading axes n, f.
 
     Gait phases and the headings of scripts that start idle, one of the four key directions, are drawn by `seed`; all
@@ -74,9 +72,7 @@ def simulate(
     return motions
 
 
-def record(
-    avatar: AvatarMesh, atlas: posmap.Atlas, scripts: Int[np.ndarray, "n f"], motion: Motion
-) -> Recording:
+def record(avatar: AvatarMesh, atlas: posmap.Atlas, scripts: Int[np.ndarray, "n f"], motion: Motion) -> Recording:
     """Position-map texels of every frame of a batch of motions."""
     encode = jax.jit(jax.vmap(lambda v: posmap.encode(atlas, v)))
     texels, roots = [], []

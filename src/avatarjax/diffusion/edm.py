@@ -27,9 +27,7 @@ def loss_weight(sigma: Float[Array, "b"]) -> Float[Array, "b"]:
     return (sigma**2 + 1) / sigma**2
 
 
-def sample_sigma(
-    key: Key[Array, ""], batch: int, low: float, high: float, at_high: float
-) -> Float[Array, "batch"]:
+def sample_sigma(key: Key[Array, ""], batch: int, low: float, high: float, at_high: float) -> Float[Array, "batch"]:
     """Training noise levels: log-uniform in [low, high], and exactly `high` with probability `at_high`.
 
     The spike at `high` teaches the one call that a one-step sampler makes.
@@ -52,9 +50,7 @@ def sigma_steps(steps: int, low: float, high: float, rho: float = 5.0) -> Float[
     return jnp.asarray(np.append(ramp, 0.0), jnp.float32)
 
 
-def euler(
-    network: Network, noise: Float[Array, "b d"], sigmas: Float[Array, "steps_plus_one"]
-) -> Float[Array, "b d"]:
+def euler(network: Network, noise: Float[Array, "b d"], sigmas: Float[Array, "steps_plus_one"]) -> Float[Array, "b d"]:
     """Deterministic Euler sampling (EDM Alg. 1 without the correction) from unit `noise` along descending `sigmas`."""
 
     def step(x, levels):

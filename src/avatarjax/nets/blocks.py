@@ -62,9 +62,7 @@ class Attention(nnx.Module):
         self.value = nnx.Linear(context or features, features, use_bias=False, rngs=rngs)
         self.out = nnx.Linear(features, features, rngs=rngs)
 
-    def __call__(
-        self, x: Float[Array, "b n c"], context: Float[Array, "b m d"] | None = None
-    ) -> Float[Array, "b n c"]:
+    def __call__(self, x: Float[Array, "b n c"], context: Float[Array, "b m d"] | None = None) -> Float[Array, "b n c"]:
         context = x if context is None else context
         q, k, v = (self._split(t) for t in (self.query(x), self.key(context), self.value(context)))
         return self.out(jax.nn.dot_product_attention(q, k, v).reshape(x.shape))

@@ -42,6 +42,9 @@ def fit(
     checkpoint, log = folder / f"{name}.safetensors", folder / f"{name}.jsonl"
     state, seconds = _resume(checkpoint, state, fingerprint)
     start = int(state.step)
+    if start >= steps:
+        tqdm.write(f"{name}: its {steps} steps were done before, reused")
+        return state
     records = [r for r in read_metrics(log) if r["step"] <= start] if start else []
     log.write_text("".join(json.dumps(r) + "\n" for r in records), encoding="utf-8")
 
@@ -65,8 +68,7 @@ def fit(
                 if time.monotonic() - saved > CHECKPOINT_SECONDS:
                     _save(checkpoint, state, fingerprint, record["seconds"])
                     saved = time.monotonic()
-    if start < steps:
-        _save(checkpoint, state, fingerprint, seconds + time.monotonic() - began)
+    _save(checkpoint, state, fingerprint, seconds + time.monotonic() - began)
     return state
 
 

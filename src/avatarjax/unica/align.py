@@ -1,4 +1,4 @@
-"""From normalised position maps to the box in which appearance works, and from there into the world (UNICA 3.7, B.1)."""
+"""From position maps to the box in which appearance works, and from there into the world (UNICA 3.7, B.1)."""
 
 from __future__ import annotations
 

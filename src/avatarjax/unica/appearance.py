@@ -94,9 +94,7 @@ def initial_base(points: Float[Array, "n 3"], height: Float[Array, ""]) -> BaseA
     )
 
 
-def coarse_gaussians(
-    base: BaseAttributes, points: Float[Array, "n 3"], height: Float[Array, ""]
-) -> Gaussians:
+def coarse_gaussians(base: BaseAttributes, points: Float[Array, "n 3"], height: Float[Array, ""]) -> Gaussians:
     """Base attributes on the points of a posed frame in box units; sizes grow by H_s / H_p (UNICA B.1).
 
     `height` is the side of this frame's box in metres, H_p.

@@ -46,7 +46,11 @@ def windows(recording: Recording, length: int, turn_window: tuple[int, int]) -> 
 
 
 def draw(
-    allowed: Bool[np.ndarray, "g"], special: Bool[np.ndarray, "g"], fraction: float, count: int, rng: np.random.Generator
+    allowed: Bool[np.ndarray, "g"],
+    special: Bool[np.ndarray, "g"],
+    fraction: float,
+    count: int,
+    rng: np.random.Generator,
 ) -> Int[np.ndarray, "count"]:
     """Indices of allowed windows; each is a special one with probability `fraction` (UNICA C.2: 70 % turning)."""
     among, others = np.flatnonzero(allowed & special), np.flatnonzero(allowed & ~special)

@@ -2,9 +2,9 @@
 
 A frame is a pose, the coefficients (k,) of its texels turned to face +z with the root's ground position removed and the
 height kept, and a root (3,) of ground position x, z in metres and heading yaw in radians. The network denoises the
-increment to the next frame, in units of its standard deviation and in the frame of the current heading; the key enters as
-the angle between the direction it asks for and the heading. So the model is equivariant to turning the world, and copying
-the last frame costs it nothing.
+increment to the next frame, in units of its standard deviation and in the frame of the current heading; the key enters
+as the angle between the direction it asks for and the heading. So the model is equivariant to turning the world, and
+copying the last frame costs it nothing.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ class Scaling:
 class CoefficientDynamics:
     """A trained model: network parameters, the basis of canonical poses, scaling, and what each action asks for.
 
-    action_yaw (a,) is the world heading in radians that an action drives towards, action_moves (a,) 1 for an action that
-    moves and 0 for one that stands.
+    action_yaw (a,) is the world heading in radians that an action drives towards, action_moves (a,) 1 for an action
+    that moves and 0 for one that stands.
     """
 
     params: Params
@@ -99,7 +99,9 @@ def canonical(atlas: Atlas, texels: Float[Array, "t 3"]) -> tuple[Float[Array, "
     return ((texels - centre[None]) @ rotations.yaw_matrix(yaw)).reshape(-1), jnp.stack([centre[0], centre[2], yaw])
 
 
-def world_texels(dynamics: CoefficientDynamics, pose: Float[Array, "k"], root: Float[Array, "3"]) -> Float[Array, "t 3"]:
+def world_texels(
+    dynamics: CoefficientDynamics, pose: Float[Array, "k"], root: Float[Array, "3"]
+) -> Float[Array, "t 3"]:
     """The inverse of `canonical`, from coefficients: world texels in metres."""
     texels = pcs.reconstruct(dynamics.basis, pose).reshape(-1, 3) @ rotations.yaw_matrix(root[2]).T
     return texels + jnp.stack([root[0], jnp.zeros_like(root[0]), root[1]])[None]
@@ -310,7 +312,7 @@ def rollout_loss(
 def _recorded_target(reached, target_root, context_root):
     """Roots to aim for from roots that have left the recorded path: recorded steps, but the recorded heading.
 
-    Position error is nobody's fault once it is made: the step on the ground is the recorded one. A wrong heading is, and
+    A wrong position is nobody's fault once it is reached: the step on the ground is the recorded one. A wrong heading
     must be undone.
     """
     b, u, _ = target_root.shape

@@ -1,7 +1,8 @@
 """Every size and number of a UNICA run, as one frozen dataclass with presets by name.
 
 Presets run the same code with different numbers: `ci` in minutes on two CPU cores, `small` is the default on a CPU,
-`base` is for one GPU, `paper` is UNICA C.1 and C.2 in full. A comment says whose a value is where it is not the paper's.
+`base` is for one GPU, `paper` is UNICA C.1 and C.2 in full. A comment says whose a value is where it is not the
+paper's.
 """
 
 from __future__ import annotations

@@ -103,8 +103,6 @@ def latent_statistics(latents: Float[Array, "n u v l"]) -> tuple[Float[Array, "l
     return jnp.mean(latents, axis=(0, 1, 2)), jnp.maximum(jnp.std(latents, axis=(0, 1, 2)), 1e-3)
 
 
-def alignment_basis(
-    fourth: Float[Array, "f t 3"], components: int, key: Key[Array, ""]
-) -> pcs.PCA:
+def alignment_basis(fourth: Float[Array, "f t 3"], components: int, key: Key[Array, ""]) -> pcs.PCA:
     """The basis of normalised fourth maps that makes six views agree (UNICA B.2)."""
     return pcs.fit(fourth.reshape(fourth.shape[0], -1), components, key)

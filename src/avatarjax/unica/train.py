@@ -137,7 +137,9 @@ def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynami
         if number == 2:
             params = {**params, "action_table": jax.lax.stop_gradient(params["action_table"])}
         dynamics = batch["frozen"].replace(denoiser=params)
-        return latent.diffusion_loss(config.latent, batch["atlas"], dynamics, key, batch["groups"], batch["actions"]), {}
+        return latent.diffusion_loss(
+            config.latent, batch["atlas"], dynamics, key, batch["groups"], batch["actions"]
+        ), {}
 
     trained = _train(run, f"unet{number}", stage, config.latent, loss, start.denoiser, batch_at)
     return start.replace(denoiser=trained)
@@ -248,9 +250,7 @@ def fit_alignment(config: UnicaConfig, data: Dataset, run: Run) -> pcs.PCA:
     return closed_form.alignment_basis(jnp.asarray(fourth), config.pca_components, run.key("pca"))
 
 
-def boxed_points(
-    upscaler: posmap.Upscaler, texels: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def boxed_points(upscaler: posmap.Upscaler, texels: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Upscaled points (n, 3) of a pose in its box, and the box' side in the texels' unit (UNICA B.1)."""
     points = posmap.upscale(upscaler, texels)
     box = align.bounding_box(points)

@@ -1,0 +1,264 @@
+"""Train an avatar that answers W/A/S/D, roll it out, and report: UNICA from simulated data to video.
+
+    python -m experiments.unica --avatar cowgirl               # preset small, the default on a CPU
+    python -m experiments.unica --avatar cowgirl --preset ci   # everything, both dynamics models, in minutes
+    python -m experiments.unica --avatar cowgirl --dynamics unet
+    python -m experiments.unica --avatar cowgirl --stage report
+
+Stages in order: data, vae, unet, coefficients, pca, base, appearance, rollout, report. Results lie in
+OUT/unica/AVATAR/PRESET/; open report.html there. A second run reuses what is finished, an interrupted one goes on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import sys
+import time
+import typing
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from avatarjax import posmap, unica
+from avatarjax.data import avatars, dataset
+from avatarjax.io import atomic, exr, ply, video
+from avatarjax.train import read_metrics
+from avatarjax.unica import files, train
+from avatarjax.unica.config import DynamicsName, UnicaConfig
+from experiments import pictures, unica_report
+
+STAGES = ("data", "vae", "unet", "coefficients", "pca", "base", "appearance", "rollout", "report")
+SCRIPT = (1,) * 60 + (2,) * 60 + (3,) * 60 + (0,) * 20  # UNICA C.4: 60 W, 60 S, 60 A, 20 idle
+ROLLOUT_CHUNK = 20
+
+
+@dataclasses.dataclass
+class Args:
+    """Train a keyboard-controlled avatar and report how well it obeys."""
+
+    avatar: str = "cowgirl"
+    """Which avatar to build and train."""
+    preset: str = ""
+    """Sizes: ci, small, base or paper. Without it, small on a CPU and base on an accelerator."""
+    dynamics: DynamicsName | None = None
+    """The model that drives the rollout: coefficients (fast) or unet (the paper's). Default: the preset's."""
+    stage: str = "all"
+    """Run only this stage, anew; stages before it are reused, or run where they are missing."""
+    resume: bool = True
+    """Go on from checkpoints. --no-resume deletes this run's results first."""
+    seed: int = 0
+    """Seed of data, training and rollout."""
+    out: Path = Path("runs")
+    """Folder under which results go, as OUT/unica/AVATAR/PRESET/."""
+
+
+@dataclasses.dataclass
+class Experiment:
+    """One run: its arguments, configuration, folder, and what its stages have produced so far."""
+
+    args: Args
+    config: UnicaConfig
+    folder: Path
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def models(self) -> tuple[DynamicsName, ...]:
+        """The dynamics models that this run trains, the one that drives its rollout first."""
+        names = typing.get_args(DynamicsName)
+        others = tuple(n for n in names if n != self.config.dynamics)
+        return (self.config.dynamics, *(others if self.config.train_both else ()))
+
+    def stages(self) -> list[str]:
+        """The stages of this run in order."""
+        skipped = set()
+        if "unet" not in self.models:
+            skipped |= {"vae", "unet"}
+        if "coefficients" not in self.models:
+            skipped.add("coefficients")
+        return [s for s in STAGES if s not in skipped]
+
+    def spec(self) -> dataset.DatasetSpec:
+        """What this run's dataset is made of."""
+        data = dataclasses.asdict(self.config.data)
+        return dataset.DatasetSpec(
+            avatar=self.args.avatar,
+            size=self.config.size,
+            upscaled=self.config.upscaled,
+            script=SCRIPT,
+            seed=self.args.seed,
+            **data,
+        )
+
+
+def run_experiment(args: Args) -> Path:
+    """Run the stages that `args` ask for; returns the folder of the results."""
+    experiment = prepare(args)
+    folder, config = experiment.folder, experiment.config
+    wanted = experiment.stages() if args.stage == "all" else [args.stage]
+    last = experiment.stages().index(wanted[-1])
+    redo = set() if args.stage == "all" else set(wanted)
+    if redo:
+        forget(experiment, args.stage)
+    began = time.monotonic()
+
+    def announce(stage: str, text: str) -> None:
+        print(f"[{time.monotonic() - began:6.1f} s] {stage}: {text}", flush=True)
+
+    print(f"avatar {args.avatar}, preset {args.preset}, dynamics {' and '.join(experiment.models)}, into {folder}")
+    if dataset.matches(folder / "data", experiment.spec()):
+        announce("data", "finished before, reused")
+    else:
+        announce("data", "simulating and rendering")
+        timed(experiment, "data", lambda: dataset.build(folder / "data", experiment.spec()))
+    data = dataset.load(folder / "data")
+    if last == 0:
+        return folder
+    run = train.Run(folder / "checkpoints", args.seed, dataset.fingerprint(folder / "data"))
+
+    trained: dict[str, typing.Any] = {}
+    upscaler = posmap.build_upscaler(data.atlas, config.upscaled)
+    steps: dict[str, typing.Callable[[], typing.Any]] = {
+        "vae": lambda: train.train_vae(config, data, run, train.new_latent_dynamics(config, data, run)),
+        "unet": lambda: train.train_unet(config, data, run, train.train_unet(config, data, run, trained["vae"], 1), 2),
+        "coefficients": lambda: train.train_coefficients(config, data, run),
+        "pca": lambda: train.fit_alignment(config, data, run),
+        "base": lambda: train.train_base(config, data, run, upscaler),
+        "appearance": lambda: train.train_appearance(config, data, run, upscaler, trained["base"]),
+    }
+    for stage in experiment.stages()[1 : last + 1]:
+        if stage in steps:
+            announce(stage, "fitting" if stage == "pca" else "training")
+            trained[stage] = timed(experiment, stage, steps[stage])
+            plot_stage(experiment, stage)
+    if last < experiment.stages().index("rollout"):
+        return folder
+
+    built = {name: assemble(config, data, upscaler, trained, name) for name in experiment.models}
+    for name, avatar in built.items():
+        files.save(folder / files.file_name(name), avatar)
+    avatar = built[config.dynamics]
+    announce("rollout", f"{len(SCRIPT)} frames, four views each")
+    frames = timed(experiment, "rollout", lambda: roll_and_draw(experiment, avatar))
+    if last == experiment.stages().index("report"):
+        announce("report", "measuring against held-out data")
+        timed(experiment, "report", lambda: unica_report.write(experiment, data, built, frames, SCRIPT))
+        announce("report", f"open {folder / 'report.html'}")
+    return folder
+
+
+def prepare(args: Args) -> Experiment:
+    """Check the arguments and make the run's folder; ValueError says what is wrong and what there is."""
+    if args.avatar not in avatars.names():
+        raise ValueError(f"unknown avatar {args.avatar!r}: choose one of {', '.join(avatars.names())}")
+    args.preset = args.preset or ("small" if jax.default_backend() == "cpu" else "base")
+    config = unica.preset(args.preset)
+    if args.dynamics:
+        config = dataclasses.replace(config, dynamics=args.dynamics)
+    experiment = Experiment(args, config, args.out / "unica" / args.avatar / args.preset)
+    if args.stage not in ("all", *experiment.stages()):
+        raise ValueError(f"unknown stage {args.stage!r} here: choose one of all, {', '.join(experiment.stages())}")
+    if not args.resume and experiment.folder.exists():
+        print(f"deleting the earlier results in {experiment.folder}")
+        shutil.rmtree(experiment.folder)
+    (experiment.folder / "checkpoints").mkdir(parents=True, exist_ok=True)
+    atomic.write_text(experiment.folder / "config.json", json.dumps(dataclasses.asdict(config), indent=2))
+    return experiment
+
+
+def forget(experiment: Experiment, stage: str) -> None:
+    """Delete what a stage has made, so that it starts anew."""
+    if stage == "data":
+        shutil.rmtree(experiment.folder / "data", ignore_errors=True)
+    for name in ("unet1", "unet2") if stage == "unet" else (stage,):
+        for path in (experiment.folder / "checkpoints").glob(f"{name}.*"):
+            path.unlink()
+
+
+def timed(experiment: Experiment, stage: str, work: typing.Callable[[], typing.Any]) -> typing.Any:
+    """Do the work of a stage and keep how long it took."""
+    began = time.monotonic()
+    result = jax.block_until_ready(work())
+    path = experiment.folder / "seconds.json"
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    # A stage that was only read back took its time in an earlier run.
+    taken = round(time.monotonic() - began, 1)
+    experiment.seconds = {**known, stage: max(taken, known.get(stage, 0.0))}
+    atomic.write_text(path, json.dumps(experiment.seconds, indent=2))
+    return result
+
+
+def plot_stage(experiment: Experiment, stage: str) -> None:
+    """Loss plots of a stage's checkpoints folder."""
+    for path in sorted((experiment.folder / "checkpoints").glob("*.jsonl")):
+        if path.stem.startswith(stage):
+            pictures.plot_losses(path.with_suffix(".png"), read_metrics(path), path.stem)
+
+
+def assemble(
+    config: UnicaConfig,
+    data: dataset.Dataset,
+    upscaler: posmap.Upscaler,
+    trained: dict[str, typing.Any],
+    dynamics: DynamicsName,
+) -> unica.Avatar:
+    """A finished avatar from the results of the stages."""
+    return unica.Avatar(
+        atlas=data.atlas,
+        upscaler=upscaler,
+        pca=trained["pca"],
+        base=trained["base"],
+        appearance=trained["appearance"],
+        dynamics=trained[dynamics],
+        standing=data.standing,
+        config=dataclasses.replace(config, dynamics=dynamics),
+    )
+
+
+def roll_and_draw(experiment: Experiment, avatar: unica.Avatar) -> unica.Frame:
+    """Roll the script out and write video, contact sheet and one frame's Gaussians; returns the frames."""
+    from tqdm import tqdm
+
+    folder = experiment.folder
+    roll = jax.jit(unica.rollout)
+    state = unica.reset(avatar, jax.random.fold_in(jax.random.key(experiment.args.seed), 7))
+    parts = []
+    for start in tqdm(range(0, len(SCRIPT), ROLLOUT_CHUNK), desc="rollout", unit=f"{ROLLOUT_CHUNK} frames"):
+        state, frames = roll(avatar, state, jnp.asarray(SCRIPT[start : start + ROLLOUT_CHUNK]))
+        parts.append(jax.device_get(frames))
+    frames = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(frames.gaussians)):
+        raise FloatingPointError("the rollout has Gaussians that are not finite: train longer, or lower the rates")
+
+    size = experiment.config.data.image_size
+    views = list(pictures.draw_frames(jax.tree.map(jnp.asarray, frames.gaussians), frames.root, size))
+    video.write_video(folder / "video.mp4", (np.concatenate(list(v), axis=1) for v in views))
+    columns = [5, 30, 58, 64, 70, 90, 118, 124, 130, 150, 178, 184, 199]
+    exr.write_png(folder / "contact_sheet.png", pictures.contact_sheet(views, columns))
+    cloud = jax.tree.map(lambda x: jnp.asarray(x[len(SCRIPT) // 2]), frames.gaussians)
+    ply.write_ply(folder / "frame.ply", cloud)
+    return frames
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line; errors a user can mend are printed, not traced."""
+    args = tyro.cli(Args, args=argv, description=__doc__)
+    jax.config.update("jax_compilation_cache_dir", str(args.out.absolute() / ".jax_cache"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    try:
+        run_experiment(args)
+    except (ValueError, FloatingPointError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\ninterrupted: run the same command to go on", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
