@@ -9,6 +9,7 @@ sparse one over voxels: every shape is then known before the points are.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -104,7 +105,7 @@ class PointTransformer(nnx.Module):
                 for c, d, h in zip(enc, config.encoder_depths, config.encoder_heads, strict=True)
             ]
         )
-        self.pool = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in zip(enc[:-1], enc[1:], strict=True)])
+        self.pool = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in itertools.pairwise(enc)])
         self.pool_norm = nnx.List([nnx.LayerNorm(c, rngs=rngs) for c in enc[1:]])
         self.decoder = nnx.List(
             [

@@ -1,7 +1,7 @@
 """Groups of four frames in the public UNICA file layout: `{sequence}_{index:05d}_{Action}/{1,2,3,4}.exr`.
 
-The files hold float32 RGB, already group-normalised, with background 0. Their world is z-up with the figure facing -y,
-and the channels are stored in reverse, (R, G, B) = (z, y, x). `read_group` and `write_group` move the raw arrays bit for
+The files hold float32 RGB, already group-normalised, with background 0. Their world is z-up with the figure facing
+-y, and the channels are stored in reverse, (R, G, B) = (z, y, x). `read_group` and `write_group` move the raw arrays bit for
 bit; `from_public` and `to_public` change the axes to ours and back.
 """
 
@@ -41,7 +41,7 @@ def read_group(folder: str | os.PathLike) -> Float[np.ndarray, "4 h w 3"]:
     maps = [exr.read_exr(Path(folder) / f"{frame}.exr") for frame in range(1, FRAMES + 1)]
     for frame, one in enumerate(maps, 1):
         if one.shape != maps[0].shape or one.shape[-1] != 3:
-            raise ValueError(f"{folder}/{frame}.exr has shape {one.shape}, expected {maps[0].shape[:2] + (3,)}")
+            raise ValueError(f"{folder}/{frame}.exr has shape {one.shape}, expected {(*maps[0].shape[:2], 3)}")
         if not np.isfinite(one).all():
             raise ValueError(f"{folder}/{frame}.exr holds a value that is not finite")
     raw = np.stack(maps)
