@@ -1,8 +1,8 @@
 """Groups of four frames in the public UNICA file layout: `{sequence}_{index:05d}_{Action}/{1,2,3,4}.exr`.
 
 The files hold float32 RGB, already group-normalised, with background 0. Their world is z-up with the figure facing
--y, and the channels are stored in reverse, (R, G, B) = (z, y, x). `read_group` and `write_group` move the raw arrays bit for
-bit; `from_public` and `to_public` change the axes to ours and back.
+-y, and the channels are stored in reverse, (R, G, B) = (z, y, x). `read_group` and `write_group` move the raw
+arrays bit for bit; `from_public` and `to_public` change the axes to ours and back.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The trained stages of UNICA (3.6, B.1, C.2), each one jitted step inside the common loop.
 
 Every function takes the config, the dataset and a `Run` (where checkpoints go, and the seed), resumes what it finds
-there, and returns plain arrays. Weights that a stage does not train travel with the batch: closed over, they would be compiled
-in as constants.
+there, and returns plain arrays. Weights that a stage does not train travel with the batch: closed over, they
+would be compiled in as constants.
 """
 
 from __future__ import annotations
