@@ -28,7 +28,7 @@ def render_reference(
     camera: Camera,
     *,
     background: ArrayLike = 0.0,
-    config: SplatConfig = SplatConfig(),  # noqa: B008
+    config: SplatConfig = SplatConfig(),
 ) -> ReferenceOutput:
     """What `render` computes, in the dtype of its input and with memory for n times h times w numbers.
 

@@ -53,7 +53,7 @@ def render(
     camera: Camera,
     *,
     background: ArrayLike = 0.0,
-    config: SplatConfig = SplatConfig(),  # noqa: B008
+    config: SplatConfig = SplatConfig(),
 ) -> RenderOutput:
     """Draw a cloud by 3D Gaussian splatting (Kerbl et al. 2023), differentiable in the cloud, camera and background.
 
@@ -73,7 +73,7 @@ def render(
 def required_capacity(
     gaussians: Gaussians,
     camera: Camera,
-    config: SplatConfig = SplatConfig(),  # noqa: B008
+    config: SplatConfig = SplatConfig(),
 ) -> int:
     """A capacity with room for this cloud in this camera, or in all of a batch of cameras, and a quarter to spare.
 
