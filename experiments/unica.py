@@ -124,7 +124,7 @@ def run_experiment(args: Args) -> Path:
     upscaler = posmap.build_upscaler(data.atlas, config.upscaled)
     steps: dict[str, typing.Callable[[], typing.Any]] = {
         "vae": lambda: train.train_vae(config, data, run, train.new_latent_dynamics(config, data, run)),
-        "unet": lambda: train.train_unet(config, data, run, train.train_unet(config, data, run, trained["vae"], 1), 2),
+        "unet": lambda: train.train_unet(config, data, run, trained["vae"]),
         "coefficients": lambda: train.train_coefficients(config, data, run),
         "pca": lambda: train.fit_alignment(config, data, run),
         "base": lambda: train.train_base(config, data, run, upscaler),
@@ -174,9 +174,8 @@ def forget(experiment: Experiment, stage: str) -> None:
     """Delete what a stage has made, so that it starts anew."""
     if stage == "data":
         shutil.rmtree(experiment.folder / "data", ignore_errors=True)
-    for name in ("unet1", "unet2") if stage == "unet" else (stage,):
-        for path in (experiment.folder / "checkpoints").glob(f"{name}.*"):
-            path.unlink()
+    for path in (experiment.folder / "checkpoints").glob(f"{stage}.*"):
+        path.unlink()
 
 
 def timed(experiment: Experiment, stage: str, work: typing.Callable[[], typing.Any]) -> typing.Any:
@@ -193,10 +192,10 @@ def timed(experiment: Experiment, stage: str, work: typing.Callable[[], typing.A
 
 
 def plot_stage(experiment: Experiment, stage: str) -> None:
-    """Loss plots of a stage's checkpoints folder."""
-    for path in sorted((experiment.folder / "checkpoints").glob("*.jsonl")):
-        if path.stem.startswith(stage):
-            pictures.plot_losses(path.with_suffix(".png"), read_metrics(path), path.stem)
+    """Plot a stage's loss beside its checkpoint; a stage in closed form has none."""
+    path = experiment.folder / "checkpoints" / f"{stage}.jsonl"
+    if path.is_file():
+        pictures.plot_losses(path.with_suffix(".png"), read_metrics(path), stage)
 
 
 def assemble(

@@ -62,7 +62,7 @@ def simulate(avatar: AvatarMesh, plans: dict[str, Int[np.ndarray, "_n _f"]], see
     looping = clips.load_clips(avatar.rig)
     keys = jax.random.split(jax.random.key(seed), len(batch))
     facing = np.random.default_rng(seed).integers(0, 4, len(batch)) * (np.pi / 2)
-    run = jax.vmap(lambda a, k, h: locomotion.simulate(avatar.rig, looping, a, k, heading=h))
+    run = jax.jit(jax.vmap(lambda a, k, h: locomotion.simulate(avatar.rig, looping, a, k, heading=h)))
     everything = run(jnp.asarray(batch), keys, jnp.asarray(facing, jnp.float32))
 
     motions, start = {}, 0

@@ -45,6 +45,7 @@ class CoefficientConfig:
     context_noise: float = 1.0
     clean_contexts: float = 0.2
     rollout_frames: int = 8
+    single_share: float = 0.3  # of the steps, before rollout training joins
 
     @property
     def features(self) -> int:

@@ -63,8 +63,8 @@ class UnicaConfig:
     loss_l1: float = 0.8  # ours; 3DGS' weights, the paper gives none
     loss_ssim: float = 0.2
     vae_stage: StageConfig = StageConfig(300_000, 32, 1.5e-5)
-    unet1_stage: StageConfig = StageConfig(100_000, 32, 5e-5)
-    unet2_stage: StageConfig = StageConfig(200_000, 32, 5e-5)
+    unet_stage: StageConfig = StageConfig(300_000, 32, 5e-5)
+    unet_steady: float = 1 / 3  # of the UNet's steps are its first stage, on steady movement only
     coefficients_stage: StageConfig = StageConfig(30_000, 128, 1e-3, ema=0.998)  # ours
     base_stage: StageConfig = StageConfig(3_000, 8, 1e-2)  # ours
     appearance_stage: StageConfig = StageConfig(15_600, 8, 1e-4)
@@ -86,8 +86,7 @@ def _base() -> UnicaConfig:
             denoiser=DenoiserConfig(channels=(128, 256, 512, 512), head_width=64, action_features=256),
         ),
         vae_stage=StageConfig(30_000, 32, 1e-4),
-        unet1_stage=StageConfig(30_000, 32, 1e-4),
-        unet2_stage=StageConfig(60_000, 32, 1e-4),
+        unet_stage=StageConfig(90_000, 32, 1e-4),
         base_stage=StageConfig(2_000, 8, 1e-2),
         appearance_stage=StageConfig(8_000, 4, 2e-4),
     )
@@ -123,8 +122,7 @@ def _small() -> UnicaConfig:
         ),
         views_per_step=4,
         vae_stage=StageConfig(3_000, 16, 5e-4),
-        unet1_stage=StageConfig(1_500, 8, 3e-4),
-        unet2_stage=StageConfig(3_000, 8, 3e-4),
+        unet_stage=StageConfig(4_500, 8, 3e-4),
         coefficients_stage=StageConfig(6_000, 128, 1e-3, ema=0.998),
         base_stage=StageConfig(400, 4, 2e-2),
         appearance_stage=StageConfig(600, 1, 1e-3),
@@ -170,10 +168,9 @@ def _ci() -> UnicaConfig:
             offset_bound=0.05,
         ),
         views_per_step=4,
-        vae_stage=StageConfig(1_200, 16, 2e-3),
-        unet1_stage=StageConfig(300, 16, 1e-3),
-        unet2_stage=StageConfig(700, 16, 1e-3),
-        coefficients_stage=StageConfig(4_000, 128, 2e-3, ema=0.998),
+        vae_stage=StageConfig(1_000, 8, 2e-3),
+        unet_stage=StageConfig(700, 8, 1e-3),
+        coefficients_stage=StageConfig(3_000, 128, 2e-3, ema=0.998),
         base_stage=StageConfig(150, 4, 3e-2),
         appearance_stage=StageConfig(250, 2, 2e-3),
     )

@@ -35,8 +35,6 @@ from avatarjax.unica.denoiser import Denoiser
 from avatarjax.unica.latent import LatentDynamics
 from avatarjax.unica.vae import VAE
 
-STEADY_ROLLOUT_SHARE = 0.3  # of the coefficient stage, before rollout training joins
-
 
 @dataclasses.dataclass(frozen=True)
 class Run:
@@ -115,34 +113,37 @@ def train_vae(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamic
     return trained.replace(latent_mean=mean, latent_scale=spread)
 
 
-def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamics, number: int) -> LatentDynamics:
-    """Diffusion training, stage 1 or 2 (UNICA 3.6).
+def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamics) -> LatentDynamics:
+    """Diffusion training in the two stages of UNICA 3.6, as one run of steps.
 
-    Stage 1 learns action embeddings and UNet on steady movement only. Stage 2 freezes the embeddings and draws 70 % of
-    its groups from the frames after a turning point.
+    The first stage learns action embeddings and UNet on steady movement only. The second freezes the embeddings and
+    draws 70 % of its groups from the frames after a turning point.
     """
     windows = batches.windows(data.train, 4, config.turn_window)
     scale = float(data.atlas.scale)
-    stage = config.unet1_stage if number == 1 else config.unet2_stage
-    fraction = 0.0 if number == 1 else config.turn_fraction
-    allowed = ~windows.turning if number == 1 else np.ones_like(windows.turning)
+    stage = config.unet_stage
+    everything = np.ones_like(windows.turning)
 
     def batch_at(step):
         rng = batches.generator(run.seed, step)
-        chosen = batches.draw(allowed, windows.turning, fraction, stage.batch, rng)
-        groups, actions = windows.groups(chosen, scale)
-        return {"atlas": data.atlas, "frozen": start.replace(denoiser={}), "groups": groups, "actions": actions}
+        steady = step < config.unet_steady * stage.steps
+        allowed, fraction = (~windows.turning, 0.0) if steady else (everything, config.turn_fraction)
+        groups, actions = windows.groups(batches.draw(allowed, windows.turning, fraction, stage.batch, rng), scale)
+        return {
+            "atlas": data.atlas,
+            "frozen": start.replace(denoiser={}),
+            "groups": groups,
+            "actions": actions,
+            "learn_actions": np.bool_(steady),
+        }
 
     def loss(params, key, batch):
-        if number == 2:
-            params = {**params, "action_table": jax.lax.stop_gradient(params["action_table"])}
-        dynamics = batch["frozen"].replace(denoiser=params)
-        return latent.diffusion_loss(
-            config.latent, batch["atlas"], dynamics, key, batch["groups"], batch["actions"]
-        ), {}
+        table = params["action_table"]["embedding"]
+        table = jnp.where(batch["learn_actions"], table, jax.lax.stop_gradient(table))
+        dynamics = batch["frozen"].replace(denoiser={**params, "action_table": {"embedding": table}})
+        return latent.diffusion_loss(config.latent, batch["atlas"], dynamics, key, batch["groups"], batch["actions"]), {}
 
-    trained = _train(run, f"unet{number}", stage, config.latent, loss, start.denoiser, batch_at)
-    return start.replace(denoiser=trained)
+    return start.replace(denoiser=_train(run, "unet", stage, config, loss, start.denoiser, batch_at))
 
 
 def coefficient_frames(data: Dataset, recording: typing.Any) -> tuple[np.ndarray, np.ndarray]:
@@ -202,7 +203,7 @@ def train_coefficients(config: UnicaConfig, data: Dataset, run: Run) -> Coeffici
             "frozen": start.replace(params={}),
             "single": windows_at(single, single.turning, stage.batch, rng),
             "long": windows_at(long, long_turning, max(1, stage.batch // 8), rng),
-            "rolling": np.bool_(step >= STEADY_ROLLOUT_SHARE * stage.steps),
+            "rolling": np.bool_(step >= settings.single_share * stage.steps),
         }
 
     def loss(params, key, batch):
