@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import typing
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-Network = typing.Callable[[Float[Array, "b d"], Float[Array, "b"]], Float[Array, "b d"]]
+Network = Callable[[Float[Array, "b d"], Float[Array, "b"]], Float[Array, "b d"]]
 
 
 def denoise(network: Network, x: Float[Array, "b d"], sigma: Float[Array, "b"]) -> Float[Array, "b d"]:

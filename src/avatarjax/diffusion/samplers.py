@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import typing
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-Denoiser = typing.Callable[[Float[Array, "*d"], Int[Array, ""]], Float[Array, "*d"]]
+Denoiser = Callable[[Float[Array, "*d"], Int[Array, ""]], Float[Array, "*d"]]
 
 
 def ddim(

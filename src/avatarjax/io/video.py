@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import typing
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -12,7 +12,7 @@ from avatarjax.io import atomic
 
 
 def write_video(
-    path: str | os.PathLike, frames: typing.Iterable[UInt8[np.ndarray, "h w 3"]], *, fps: int = 30, quality: int = 18
+    path: str | os.PathLike, frames: Iterable[UInt8[np.ndarray, "h w 3"]], *, fps: int = 30, quality: int = 18
 ) -> None:
     """Write RGB frames of one size, odd sides padded to even by repeating the border; `quality` is x264's CRF.
 

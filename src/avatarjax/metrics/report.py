@@ -7,6 +7,7 @@ import html
 import math
 import os
 import typing
+from collections.abc import Sequence
 from pathlib import Path
 
 from avatarjax.io import atomic
@@ -46,10 +47,10 @@ class Report:
     def table(
         self,
         caption: str,
-        columns: typing.Sequence[str],
-        rows: typing.Sequence[typing.Sequence[typing.Any]],
+        columns: Sequence[str],
+        rows: Sequence[Sequence[typing.Any]],
         *,
-        verdicts: typing.Sequence[bool | None] | None = None,
+        verdicts: Sequence[bool | None] | None = None,
     ) -> None:
         """A table; floats get four significant digits, None a dash. `verdicts` colours the last cell of each row."""
         head = "".join(f"<th>{html.escape(c)}</th>" for c in columns)

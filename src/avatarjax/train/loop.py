@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-import typing
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -19,9 +19,9 @@ CHECKPOINT_SECONDS = 30.0
 
 
 def fit(
-    step: typing.Callable[[TrainState, Batch], tuple[TrainState, Metrics]],
+    step: Callable[[TrainState, Batch], tuple[TrainState, Metrics]],
     state: TrainState,
-    batch_at: typing.Callable[[int], Batch],
+    batch_at: Callable[[int], Batch],
     steps: int,
     folder: str | os.PathLike,
     name: str,

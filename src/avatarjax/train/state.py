@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import typing
+from collections.abc import Callable
 
 import flax.struct
 import jax
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 Params = typing.Any
 Batch = typing.Any
 Metrics = dict[str, Float[Array, ""]]
-Loss = typing.Callable[[Params, Key[Array, ""], Batch], tuple[Float[Array, ""], Metrics]]
+Loss = Callable[[Params, Key[Array, ""], Batch], tuple[Float[Array, ""], Metrics]]
 
 
 @typing.no_type_check
@@ -52,7 +53,7 @@ def weights(state: TrainState) -> Params:
 
 def make_step(
     loss: Loss, transform: optax.GradientTransformation, *, decay: float = 0.0
-) -> typing.Callable[[TrainState, Batch], tuple[TrainState, Metrics]]:
+) -> Callable[[TrainState, Batch], tuple[TrainState, Metrics]]:
     """A jitted `(state, batch) -> (state, metrics)` with donated state.
 
     `loss(params, key, batch)` returns the loss and more metrics; `decay` is that of the average of the weights. The

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from collections.abc import Callable
 
 from avatarjax.nets.point_transformer import PointTransformerConfig
 from avatarjax.unica.appearance import AppearanceConfig
@@ -176,7 +177,7 @@ def _ci() -> UnicaConfig:
     )
 
 
-PRESETS: dict[str, typing.Callable[[], UnicaConfig]] = {
+PRESETS: dict[str, Callable[[], UnicaConfig]] = {
     "ci": _ci,
     "small": _small,
     "base": _base,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import typing
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ def millimetres(predicted: np.ndarray, truth: np.ndarray, scale: float) -> Float
     return 1000 / scale * np.linalg.norm(np.asarray(predicted) - truth, axis=-1).mean(-1)
 
 
-def _in_chunks(function: typing.Callable, *arrays: np.ndarray) -> np.ndarray:
+def _in_chunks(function: Callable, *arrays: np.ndarray) -> np.ndarray:
     """`function` over leading-axis blocks of one size: one compilation, bounded memory."""
     count = len(arrays[0])
     parts = []
