@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -92,12 +92,12 @@ def draw_frames(gaussians: Gaussians, roots: jax.Array, size: int, *, label: str
         print(f"warning: {dropped} splat intersections did not fit and were dropped from the pictures")
 
 
-def contact_sheet(views: typing.Sequence[np.ndarray], columns: typing.Sequence[int]) -> np.ndarray:
+def contact_sheet(views: Sequence[np.ndarray], columns: Sequence[int]) -> np.ndarray:
     """Chosen frames across, the four views down."""
     return np.concatenate([np.concatenate([views[k][v] for k in columns], axis=1) for v in range(4)], axis=0)
 
 
-def save_plot(path: Path, draw: typing.Callable[[typing.Any], None], *, size: tuple[float, float] = (7, 4)) -> None:
+def save_plot(path: Path, draw: Callable[[typing.Any], None], *, size: tuple[float, float] = (7, 4)) -> None:
     """Save a matplotlib figure that `draw(axes)` fills in, atomically and without a display."""
     from matplotlib.figure import Figure
 
@@ -107,7 +107,7 @@ def save_plot(path: Path, draw: typing.Callable[[typing.Any], None], *, size: tu
         figure.savefig(temporary, dpi=110, format=path.suffix[1:])
 
 
-def plot_losses(path: Path, records: typing.Sequence[dict[str, float]], name: str) -> None:
+def plot_losses(path: Path, records: Sequence[dict[str, float]], name: str) -> None:
     """Loss against step, both on the scale that shows it best."""
 
     def draw(axes):

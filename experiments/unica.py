@@ -17,6 +17,7 @@ import shutil
 import sys
 import time
 import typing
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -122,7 +123,7 @@ def run_experiment(args: Args) -> Path:
 
     trained: dict[str, typing.Any] = {}
     upscaler = posmap.build_upscaler(data.atlas, config.upscaled)
-    steps: dict[str, typing.Callable[[], typing.Any]] = {
+    steps: dict[str, Callable[[], typing.Any]] = {
         "vae": lambda: train.train_vae(config, data, run, train.new_latent_dynamics(config, data, run)),
         "unet": lambda: train.train_unet(config, data, run, trained["vae"]),
         "coefficients": lambda: train.train_coefficients(config, data, run),
@@ -178,7 +179,7 @@ def forget(experiment: Experiment, stage: str) -> None:
         path.unlink()
 
 
-def timed(experiment: Experiment, stage: str, work: typing.Callable[[], typing.Any]) -> typing.Any:
+def timed(experiment: Experiment, stage: str, work: Callable[[], typing.Any]) -> typing.Any:
     """Do the work of a stage and keep how long it took."""
     began = time.monotonic()
     result = jax.block_until_ready(work())

@@ -57,7 +57,7 @@ def transform(
         jnp.broadcast_to(rotations.from_matrix(rotation), gaussians.quats.shape), gaussians.quats
     )
     return gaussians.replace(
-        means=scale * gaussians.means @ rotation.T + translation,
+        means=scale * gaussians.means @ rotation.T + translation[None],
         quats=quats,
         log_scales=gaussians.log_scales + jnp.log(scale),
     )

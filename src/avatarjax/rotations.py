@@ -112,10 +112,10 @@ def similarity_fit(
     w = jnp.ones(source.shape[0], source.dtype) if weights is None else weights
     w = w / jnp.sum(w)
     mean_s, mean_t = w @ source, w @ target
-    s, t = source - mean_s, target - mean_t
+    s, t = source - mean_s[None], target - mean_t[None]
     u, d, vt = jnp.linalg.svd((t * w[:, None]).T @ s)
     sign = jnp.where(jnp.linalg.det(u) * jnp.linalg.det(vt) < 0, -1.0, 1.0)
     flip = jnp.stack([jnp.ones_like(sign), jnp.ones_like(sign), sign])
-    rotation = (u * flip) @ vt
+    rotation = (u * flip[None]) @ vt
     scale = jnp.sum(d * flip) / jnp.maximum(jnp.sum(w[:, None] * s * s), _TINY)
     return scale, rotation, mean_t - scale * rotation @ mean_s

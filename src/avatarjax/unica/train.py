@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import hashlib
 import typing
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -56,7 +57,7 @@ def _train(
     config: typing.Any,
     loss: Loss,
     initial: Params,
-    batch_at: typing.Callable[[int], typing.Any],
+    batch_at: Callable[[int], typing.Any],
 ) -> Params:
     transform = optimiser(stage.learning_rate, stage.steps)
     state: TrainState = new_state(initial, transform, run.key(name), averaged=stage.ema > 0)
@@ -141,7 +142,8 @@ def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynami
         table = params["action_table"]["embedding"]
         table = jnp.where(batch["learn_actions"], table, jax.lax.stop_gradient(table))
         dynamics = batch["frozen"].replace(denoiser={**params, "action_table": {"embedding": table}})
-        return latent.diffusion_loss(config.latent, batch["atlas"], dynamics, key, batch["groups"], batch["actions"]), {}
+        groups, actions = batch["groups"], batch["actions"]
+        return latent.diffusion_loss(config.latent, batch["atlas"], dynamics, key, groups, actions), {}
 
     return start.replace(denoiser=_train(run, "unet", stage, config, loss, start.denoiser, batch_at))
 
