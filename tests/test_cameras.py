@@ -24,8 +24,7 @@ def test_rotation_is_proper():
 
 def points_in_front(offsets):
     camera = look_at((0.0, 1.0, 4.0), (0.0, 1.0, 0.0), **SIZE)
-    with jax.numpy_rank_promotion("allow"):
-        return project(camera, jnp.asarray([[0.0, 1.0, 0.0]]) + jnp.asarray(offsets, jnp.float32))
+    return project(camera, jnp.asarray([[0.0, 1.0, 0.0]]) + jnp.asarray(offsets, jnp.float32))
 
 
 def test_target_lands_in_the_middle_at_its_distance():

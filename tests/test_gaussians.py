@@ -16,8 +16,7 @@ def cloud(n=6):
 
 
 def transform(gaussians, *arguments):
-    with jax.numpy_rank_promotion("allow"):
-        return clouds.transform(gaussians, *arguments)
+    return clouds.transform(gaussians, *arguments)
 
 
 def covariances(gaussians):

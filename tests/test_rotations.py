@@ -107,8 +107,7 @@ def test_similarity_fit_recovers_a_similarity(seed):
     source = jnp.asarray(rng.normal(size=(20, 3)), jnp.float32)
     rotation = rotations.to_matrix(quaternions((), seed))
     target = 1.7 * source @ rotation.T + jnp.asarray([[1.0, -2.0, 0.5]])
-    with jax.numpy_rank_promotion("allow"):
-        scale, fitted, translation = rotations.similarity_fit(source, target)
+    scale, fitted, translation = rotations.similarity_fit(source, target)
     np.testing.assert_allclose(scale, 1.7, rtol=1e-5)
     np.testing.assert_allclose(fitted, rotation, atol=1e-5)
     np.testing.assert_allclose(translation, [1.0, -2.0, 0.5], atol=1e-5)
@@ -116,14 +115,12 @@ def test_similarity_fit_recovers_a_similarity(seed):
 
 def test_similarity_fit_of_a_mirror_image_is_still_a_rotation():
     source = jnp.asarray(np.random.default_rng(0).normal(size=(20, 3)), jnp.float32)
-    with jax.numpy_rank_promotion("allow"):
-        _, rotation, _ = rotations.similarity_fit(source, source * jnp.asarray([[-1.0, 1.0, 1.0]]))
+    _, rotation, _ = rotations.similarity_fit(source, source * jnp.asarray([[-1.0, 1.0, 1.0]]))
     np.testing.assert_allclose(np.linalg.det(rotation), 1.0, atol=1e-5)
 
 
 def test_similarity_fit_ignores_points_without_weight():
     source = jnp.asarray(np.random.default_rng(0).normal(size=(20, 3)), jnp.float32)
     target = source.at[0].set(100.0)
-    with jax.numpy_rank_promotion("allow"):
-        scale, _, _ = rotations.similarity_fit(source, target, jnp.ones(20).at[0].set(0.0))
+    scale, _, _ = rotations.similarity_fit(source, target, jnp.ones(20).at[0].set(0.0))
     np.testing.assert_allclose(scale, 1.0, rtol=1e-5)

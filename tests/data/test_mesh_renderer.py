@@ -1,6 +1,5 @@
 """The ground-truth renderer against the projection of the camera and known pictures."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,8 +13,7 @@ QUAD_UVS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)[QUAD]
 
 def project(camera, points):
     """Pixels (n, 2) of points (n, 3)."""
-    with jax.numpy_rank_promotion("allow"):
-        return np.asarray(cameras.project(camera, jnp.asarray(points, jnp.float32))[0], np.float64)
+    return np.asarray(cameras.project(camera, jnp.asarray(points, jnp.float32))[0], np.float64)
 
 
 def checker():

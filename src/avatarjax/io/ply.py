@@ -11,8 +11,10 @@ import os
 import typing
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
+from avatarjax.gaussians import Gaussians
 from avatarjax.io import atomic
 
 # The spherical harmonic of degree 0: sqrt(1 / (4 pi)).
@@ -33,19 +35,7 @@ _DTYPES = {
 _HEADER_LIMIT = 65536
 
 
-@typing.runtime_checkable
-class Cloud(typing.Protocol):
-    """What is written: anything with the fields of `avatarjax.Gaussians`, as JAX or NumPy arrays."""
-
-    means: typing.Any
-    log_scales: typing.Any
-    quats: typing.Any
-    logit_opacities: typing.Any
-    colors: typing.Any
-    sh: typing.Any
-
-
-def write_ply(path: str | os.PathLike, gaussians: Cloud) -> None:
+def write_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
     """Write one cloud, atomically. Raises ValueError for a batch of clouds."""
     if gaussians.means.ndim != 2:
         raise ValueError(f"a .ply file holds one cloud, got means of shape {gaussians.means.shape}")
@@ -70,8 +60,8 @@ def write_ply(path: str | os.PathLike, gaussians: Cloud) -> None:
         temporary.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
 
 
-def read_ply(path: str | os.PathLike) -> dict[str, np.ndarray | None]:
-    """Read one cloud as the fields of `avatarjax.Gaussians`, float32: `Gaussians(**read_ply(path))`.
+def read_ply(path: str | os.PathLike) -> Gaussians:
+    """Read one cloud.
 
     f_rest_* become `sh` (n, k, 3), None where there are none. Raises ValueError, with the name of the file, where it is
     missing, truncated, ASCII, big endian, no .ply at all, or lacks a property of Gaussian clouds.
@@ -89,14 +79,14 @@ def read_ply(path: str | os.PathLike) -> dict[str, np.ndarray | None]:
     vertices = np.frombuffer(data, dtype)
     rest = [f"f_rest_{k}" for k in range(sum(name.startswith("f_rest_") for name in dtype.names))]
     sh = _gather(vertices, rest).reshape(count, 3, len(rest) // 3).transpose(0, 2, 1) if rest else None
-    return {
-        "means": _gather(vertices, _POSITION),
-        "log_scales": _gather(vertices, _SCALE),
-        "quats": _gather(vertices, _ROTATION),
-        "logit_opacities": vertices["opacity"].astype(np.float32),
-        "colors": _gather(vertices, _DC) * np.float32(_SH_0) + np.float32(0.5),
-        "sh": sh,
-    }
+    return Gaussians(
+        means=jnp.asarray(_gather(vertices, _POSITION)),
+        log_scales=jnp.asarray(_gather(vertices, _SCALE)),
+        quats=jnp.asarray(_gather(vertices, _ROTATION)),
+        logit_opacities=jnp.asarray(vertices["opacity"].astype(np.float32)),
+        colors=jnp.asarray(_gather(vertices, _DC) * np.float32(_SH_0) + np.float32(0.5)),
+        sh=None if sh is None else jnp.asarray(sh),
+    )
 
 
 def _gather(vertices: np.ndarray, names: list[str] | tuple[str, ...]) -> np.ndarray:
