@@ -67,11 +67,14 @@ class Block(nnx.Module):
         # A last, incomplete patch is moved back over points of the one before it, so that all patches are full.
         starts = jnp.minimum(jnp.arange(patches) * size, n - size)
         rows = (starts[:, None] + jnp.arange(size)[None]).reshape(-1)
+        # Points that are in both of the last two patches take what the last one says: a gather, so on every device.
+        place = jnp.arange(n)
+        place = jnp.where(place < n - size, place, place + patches * size - n)
 
         x = x[order]
         x = x + self.position(x[None])[0]
         attended = self.attention(self.norm1(x)[rows].reshape(patches, size, channels)).reshape(-1, channels)
-        x = x + jnp.zeros_like(x).at[rows].set(attended)
+        x = x + attended[place]
         x = x + self.down(jax.nn.gelu(self.up(self.norm2(x))))
         return jnp.zeros_like(x).at[order].set(x, unique_indices=True)
 
