@@ -47,4 +47,5 @@ def ddim_timesteps(train_steps: int, sample_steps: int) -> Int[Array, "sample_st
     """
     if not 1 <= sample_steps <= train_steps:
         raise ValueError(f"sampling steps must lie in 1..{train_steps}, got {sample_steps}")
-    return jnp.asarray(np.round(np.arange(train_steps, 0, -train_steps / sample_steps)).astype(np.int32) - 1)
+    ends = train_steps - np.arange(sample_steps) * train_steps / sample_steps
+    return jnp.asarray(np.round(ends).astype(np.int32) - 1)
