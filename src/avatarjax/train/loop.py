@@ -72,7 +72,7 @@ def fit(
     return state
 
 
-def read_metrics(path: str | os.PathLike) -> list[dict[str, float]]:
+def read_metrics(path: str | os.PathLike) -> list[dict[str, int | float]]:
     """The records of a metrics file, without a last line that was cut off; empty where there is no file."""
     if not Path(path).is_file():
         return []

@@ -64,7 +64,7 @@ def make_step(
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
         key = jax.random.fold_in(state.key, state.step)
         (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(state.params, key, batch)
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         good = jnp.isfinite(norm)
         gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
         updates, opt_state = transform.update(gradient, state.opt_state, state.params)
@@ -75,7 +75,7 @@ def make_step(
         if average is not None:
             # A young average follows the weights closely, so that it forgets where they started.
             rate = jnp.minimum(decay, (1.0 + state.step) / (10.0 + state.step))
-            average = jax.tree.map(lambda a, p: rate * a + (1 - rate) * p, average, params)
+            average = keep(jax.tree.map(lambda a, p: rate * a + (1 - rate) * p, average, params), average)
         new = TrainState(params, average, opt_state, state.key, state.step + 1)
         return new, {"loss": value, "gradient_norm": norm, "skipped": 1.0 - good, **metrics}
 
