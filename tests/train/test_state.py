@@ -1,0 +1,107 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from avatarjax.train import make_step, new_state, weights
+from avatarjax.train.state import optimiser
+
+
+def quadratic(params, key, batch):
+    loss = jnp.sum((params["w"] - batch) ** 2)
+    return loss, {"largest": jnp.max(params["w"])}
+
+
+TARGET = np.array([1.0, -2.0, 3.0], np.float32)
+SGD = optax.sgd(0.1)
+
+
+def fresh(key, transform=SGD, **options):
+    return new_state({"w": jnp.zeros(3)}, transform, key, **options)
+
+
+@pytest.fixture(scope="module")
+def step():
+    return make_step(quadratic, SGD, decay=0.5)
+
+
+def copied(state):
+    return jax.tree.map(np.array, (state.params, state.average, state.opt_state))
+
+
+def test_a_step_goes_down_the_gradient(key, step):
+    state, metrics = step(fresh(key), TARGET)
+    np.testing.assert_allclose(state.params["w"], 0.2 * TARGET, rtol=1e-6)
+    assert float(metrics["loss"]) == pytest.approx(14)
+    assert float(metrics["gradient_norm"]) == pytest.approx(2 * np.sqrt(14))
+    assert float(metrics["skipped"]) == 0 and float(metrics["largest"]) == 0
+    assert int(state.step) == 1
+
+
+def test_many_steps_reach_the_minimum(key, step):
+    state = fresh(key)
+    for _ in range(40):
+        state, _ = step(state, TARGET)
+    np.testing.assert_allclose(state.params["w"], TARGET, atol=1e-3)
+
+
+def test_the_average_follows_the_weights(key, step):
+    state = fresh(key, averaged=True)
+    expected = np.zeros(3)
+    for k in range(12):
+        state, _ = step(state, TARGET)
+        rate = min(0.5, (1 + k) / (10 + k))
+        expected = rate * expected + (1 - rate) * np.asarray(state.params["w"])
+    np.testing.assert_allclose(state.average["w"], expected, rtol=1e-5)
+    assert weights(state) is state.average
+
+
+def test_without_an_average_the_weights_are_the_parameters(key):
+    state = fresh(key)
+    assert state.average is None and weights(state) is state.params
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing_and_is_counted(key):
+    transform = optax.adam(0.1)
+    step = make_step(quadratic, transform, decay=0.5)
+    state = fresh(key, transform, averaged=True)
+    for _ in range(3):
+        state, _ = step(state, TARGET)
+    before = copied(state)
+    state, metrics = step(state, np.full(3, np.nan, np.float32))
+    jax.tree.map(np.testing.assert_array_equal, copied(state), before)
+    assert float(metrics["skipped"]) == 1 and int(state.step) == 4
+    state, metrics = step(state, TARGET)
+    assert float(metrics["skipped"]) == 0
+    assert not np.array_equal(state.params["w"], before[0]["w"])
+
+
+def test_the_state_is_donated(key, step):
+    state = fresh(key)
+    step(state, TARGET)
+    assert state.params["w"].is_deleted()
+
+
+def test_every_step_has_its_own_randomness(key):
+    step = make_step(lambda p, k, b: (jnp.sum(p["w"]) + jax.random.normal(k), {}), SGD)
+    state, losses = fresh(key), []
+    for _ in range(3):
+        state, metrics = step(state, None)
+        losses.append(float(metrics["loss"] - jnp.sum(state.params["w"] + 0.1)))
+    assert len({round(x, 4) for x in losses}) == 3
+
+
+def test_the_rate_warms_up_then_decays_to_a_tenth():
+    """Under a constant gradient Adam's steps are as long as the rate."""
+    transform = optimiser(0.5, 100)
+    state = transform.init(jnp.zeros(()))
+    update = jax.jit(transform.update)
+    rates = []
+    for _ in range(101):
+        step, state = update(jnp.asarray(0.3), state)
+        rates.append(-float(step))
+    assert rates[0] == pytest.approx(0.025, rel=1e-2)
+    assert max(rates) == pytest.approx(0.5, rel=1e-2) and int(np.argmax(rates)) == 3
+    assert rates[-1] == pytest.approx(0.05, rel=1e-2)
+    assert (np.diff(rates[3:]) < 1e-5).all()
