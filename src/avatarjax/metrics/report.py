@@ -10,6 +10,8 @@ import typing
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from avatarjax.io import atomic
 
 _STYLE = """
@@ -87,6 +89,6 @@ class Report:
 def _cell(value: typing.Any) -> str:
     if value is None:
         return "–"
-    if isinstance(value, float):
+    if isinstance(value, (float, np.floating)):
         return "not finite" if not math.isfinite(value) else f"{value:.4g}"
     return str(value)

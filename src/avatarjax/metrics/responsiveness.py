@@ -17,7 +17,7 @@ def movement_directions(roots: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "g
     return np.arctan2(step[:, 0], step[:, 2])
 
 
-def angle_between(a: typing.Any, b: typing.Any) -> np.ndarray:
+def angle_between(a: typing.Any, b: typing.Any) -> np.ndarray | np.floating:
     """Absolute difference of angles in radians, at most pi."""
     return np.abs((np.asarray(a) - np.asarray(b) + np.pi) % (2 * np.pi) - np.pi)
 
@@ -38,7 +38,7 @@ def turn_frames(
     near = angle_between(directions, wanted) < np.deg2rad(tolerance)
     for frame in range(change, len(near) - hold + 1):
         if near[frame : frame + hold].all():
-            return frame - change
+            return int(frame - change)
     return None
 
 
@@ -63,7 +63,9 @@ def responses(
     records = []
     for start, end in zip(starts, np.append(starts[1:], len(actions)), strict=True):
         action = int(actions[start])
-        late = slice(min(start + settle, end - 1), min(end, len(speed)))
+        # A path of f frames has f - 1 steps: a key pressed at the last frame has none, and gets the last one there is.
+        end = min(end, len(speed))
+        late = slice(min(start + settle, end - 1), end)
         record = {"start": int(start), "action": action, "speed": float(speed[late].mean())}
         if moves[action]:
             record["heading_error"] = float(np.rad2deg(angle_between(directions[late], yaw[action])).mean())
@@ -71,6 +73,6 @@ def responses(
             from_motion = before is not None and bool(moves[before])
             turn = float(np.rad2deg(angle_between(yaw[before], yaw[action]))) if from_motion else None
             record["turn"] = turn
-            record["turn_frames"] = turn_frames(directions, start, float(yaw[action])) if start else None
+            record["turn_frames"] = turn_frames(directions[:end], int(start), float(yaw[action])) if start else None
         records.append(record)
     return records
