@@ -92,6 +92,13 @@ def draw_frames(gaussians: Gaussians, roots: jax.Array, size: int, *, label: str
         print(f"warning: {dropped} splat intersections did not fit and were dropped from the pictures")
 
 
+def key_frames(script: Sequence[int]) -> list[int]:
+    """Frames worth seeing: shortly after each key change, well after it, and just before the next."""
+    starts = [0] + [k for k in range(1, len(script)) if script[k] != script[k - 1]]
+    ends = [*starts[1:], len(script)]
+    return sorted({k for s, e in zip(starts, ends, strict=True) for k in (s + 4, s + 10, s + 30, e - 2) if s <= k < e})
+
+
 def contact_sheet(views: Sequence[np.ndarray], columns: Sequence[int]) -> np.ndarray:
     """Chosen frames across, the four views down."""
     return np.concatenate([np.concatenate([views[k][v] for k in columns], axis=1) for v in range(4)], axis=0)

@@ -237,8 +237,7 @@ def roll_and_draw(experiment: Experiment, avatar: unica.Avatar) -> unica.Frame:
     size = experiment.config.data.image_size
     views = list(pictures.draw_frames(jax.tree.map(jnp.asarray, frames.gaussians), frames.root, size))
     video.write_video(folder / "video.mp4", (np.concatenate(list(v), axis=1) for v in views))
-    columns = [5, 30, 58, 64, 70, 90, 118, 124, 130, 150, 178, 184, 199]
-    exr.write_png(folder / "contact_sheet.png", pictures.contact_sheet(views, columns))
+    exr.write_png(folder / "contact_sheet.png", pictures.contact_sheet(views, pictures.key_frames(SCRIPT)))
     cloud = jax.tree.map(lambda x: jnp.asarray(x[len(SCRIPT) // 2]), frames.gaussians)
     ply.write_ply(folder / "frame.ply", cloud)
     return frames

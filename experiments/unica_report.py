@@ -69,7 +69,8 @@ def write(
         }
     nearest = _nearest(avatar, data, frames)
     measured["drift_mm"] = {n: _summary(x) for n, x in nearest.items()}
-    measured["ground_mm"] = [round(1000 * float(g), 2) for g in np.asarray(frames.info.ground)[[0, 59, 119, 179, -1]]]
+    ground = np.asarray(frames.info.ground)
+    measured["ground_mm"] = {int(k): round(1000 * float(ground[k]), 2) for k in np.linspace(0, len(ground) - 1, 5)}
     measured["seconds"] = experiment.seconds
     atomic.write_text(folder / "metrics.json", json.dumps(measured, indent=2))
 
@@ -82,10 +83,15 @@ def write(
         logy=True,
     )
     pictures.plot_lines(folder / "drift.png", nearest, "frame", "distance to the nearest training frame, mm")
-    _page(experiment, measured, built).write(folder / "report.html")
+    _page(experiment, measured, built, script).write(folder / "report.html")
 
 
-def _page(experiment: Experiment, measured: dict[str, typing.Any], built: dict[str, unica.Avatar]) -> Report:
+def _page(
+    experiment: Experiment,
+    measured: dict[str, typing.Any],
+    built: dict[str, unica.Avatar],
+    script: tuple[int, ...],
+) -> Report:
     folder, config = experiment.folder, experiment.config
     page = Report(f"UNICA: {experiment.args.avatar}, preset {experiment.args.preset}")
     page.code("python -m experiments.unica " + " ".join(sys.argv[1:]))
@@ -94,7 +100,7 @@ def _page(experiment: Experiment, measured: dict[str, typing.Any], built: dict[s
         "Views: front, left side, back and right side; the camera follows, squares are half a metre."
     )
     page.media(folder / "video.mp4", "The rollout: every frame is generated from the three before it and the key.")
-    page.media(folder / "contact_sheet.png", "Frames 5, 30, 58 | 64, 70, 90, 118 | 124, 130, 150, 178 | 184, 199.")
+    page.media(folder / "contact_sheet.png", f"Frames {pictures.key_frames(script)}, four views.")
 
     page.heading("Does it obey?")
     page.media(folder / "path.png", "Root paths from above, and the controller's that made the training data.")
@@ -120,7 +126,7 @@ def _page(experiment: Experiment, measured: dict[str, typing.Any], built: dict[s
     )
     page.media(folder / "components.png", "Alignment error against the number of components (as UNICA Fig. B).")
     page.media(folder / "drift.png", "Drift: the rollout, and held-out recordings for comparison.")
-    page.text(f"Lowest point of the body at frames 0, 59, 119, 179, 199 of the rollout, mm: {measured['ground_mm']}.")
+    page.text(f"Height of the lowest point by frame of the rollout, mm (a trend is vertical drift): {measured['ground_mm']}.")
 
     page.heading("What is poor")
     for line in _poor(rows, verdicts, measured):

@@ -19,3 +19,40 @@ jax.config.update("jax_compilation_cache_dir", os.environ.get("AVATARJAX_TEST_CA
 def key():
     """A PRNG key; split it where more than one is needed."""
     return jax.random.key(0)
+
+
+@pytest.fixture(scope="session")
+def tiny_spec():
+    """The smallest dataset that holds every kind of data."""
+    from avatarjax.data import dataset
+
+    return dataset.DatasetSpec(
+        avatar="cowgirl",
+        size=32,
+        upscaled=64,
+        transition_frames=60,
+        held_out_frames=60,
+        image_poses=2,
+        image_views=2,
+        standing_views=2,
+        image_size=32,
+        script=(1,) * 10 + (2,) * 10,
+    )
+
+
+@pytest.fixture(scope="session")
+def tiny_folder(tiny_spec, tmp_path_factory):
+    """The folder of the tiny dataset, built once: read only."""
+    from avatarjax.data import dataset
+
+    folder = tmp_path_factory.mktemp("tiny") / "data"
+    dataset.build(folder, tiny_spec, progress=False)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_data(tiny_folder):
+    """The tiny dataset."""
+    from avatarjax.data import dataset
+
+    return dataset.load(tiny_folder)

@@ -19,7 +19,7 @@ def movement_directions(roots: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "g
 
 def angle_between(a: typing.Any, b: typing.Any) -> np.ndarray | np.floating:
     """Absolute difference of angles in radians, at most pi."""
-    return np.abs((np.asarray(a) - np.asarray(b) + np.pi) % (2 * np.pi) - np.pi)
+    return np.asarray(np.abs((np.asarray(a) - np.asarray(b) + np.pi) % (2 * np.pi) - np.pi))
 
 
 def turn_frames(

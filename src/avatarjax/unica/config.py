@@ -173,7 +173,7 @@ def _ci() -> UnicaConfig:
         unet_stage=StageConfig(700, 8, 1e-3),
         coefficients_stage=StageConfig(3_000, 128, 2e-3, ema=0.998),
         base_stage=StageConfig(150, 4, 3e-2),
-        appearance_stage=StageConfig(250, 2, 2e-3),
+        appearance_stage=StageConfig(300, 1, 2e-3),
     )
 
 
