@@ -1,0 +1,97 @@
+"""The main job end to end at the smallest sizes: every stage, both models, the report, and a second run that reuses."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import avatarjax as aj
+from avatarjax.unica import config as configs
+from avatarjax.unica.config import StageConfig
+from experiments import unica as experiment
+
+
+CI = configs.preset("ci")
+
+
+def tiny():
+    few = StageConfig(3, 2, 1e-3)
+    return dataclasses.replace(
+        CI,
+        pca_components=24,
+        upscaled=64,
+        data=configs.DataConfig(
+            transition_frames=105,
+            held_out_frames=60,
+            image_poses=2,
+            image_views=2,
+            standing_views=4,
+            image_size=32,
+        ),
+        views_per_step=2,
+        vae_stage=few,
+        unet_stage=few,
+        coefficients_stage=dataclasses.replace(few, ema=0.9, batch=8),
+        base_stage=few,
+        appearance_stage=few,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(configs.PRESETS, "ci", tiny)
+        patch.setattr(experiment, "SCRIPT", (1,) * 8 + (2,) * 8 + (0,) * 4)
+        yield experiment.run_experiment(experiment.Args(preset="ci", out=out))
+
+
+def test_everything_that_is_promised_is_written(finished):
+    expected = ["config.json", "metrics.json", "report.html", "video.mp4", "contact_sheet.png", "path.png", "frame.ply"]
+    for name in [*expected, "avatar-coefficients.safetensors", "avatar-unet.safetensors"]:
+        assert (finished / name).stat().st_size > 100, name
+    for stage in ("vae", "unet", "coefficients", "base", "appearance"):
+        assert (finished / "checkpoints" / f"{stage}.safetensors").is_file()
+        assert (finished / "checkpoints" / f"{stage}.jsonl").read_text().count("\n") == 3
+
+
+@pytest.mark.parametrize("dynamics", ["coefficients", "unet"])
+def test_the_trained_avatar_loads_and_rolls_out(finished, dynamics):
+    avatar = aj.load(finished, dynamics=dynamics)
+    state = aj.unica.reset(avatar, jax.random.key(0))
+    state, frame = jax.jit(aj.unica.step)(avatar, state, jnp.int32(1))
+    assert frame.posmap.shape == (32, 32, 3)
+    picture = aj.render(frame.gaussians, aj.look_at((0, 1, 4), (0, 1, 0), width=32, height=32))
+    assert float(picture.alpha.max()) > 0.5
+
+
+def test_the_report_names_every_stage_and_embeds_its_pictures(finished):
+    page = (finished / "report.html").read_text()
+    for text in ("Does it obey?", "against copy last", "autoencoder", "PCA with", "appearance network", "What is poor"):
+        assert text in page
+    assert page.count("data:image/png;base64") >= 8
+    assert page.count("data:video/mp4;base64") == 1
+
+
+def test_a_second_run_reuses_what_is_finished(finished, capsys):
+    before = {p: p.stat().st_mtime_ns for p in (finished / "checkpoints").glob("*.safetensors")}
+    args = experiment.Args(preset="ci", out=finished.parents[2], stage="appearance")
+    (finished / "checkpoints" / "appearance.jsonl").unlink()
+    experiment.run_experiment(args)
+    printed = capsys.readouterr()
+    assert "data: finished before, reused" in printed.out
+    after = {p: p.stat().st_mtime_ns for p in (finished / "checkpoints").glob("*.safetensors")}
+    changed = {p.stem for p in after if after[p] != before[p]}
+    assert changed == {"appearance"}
+
+
+def test_a_damaged_dataset_is_named_with_the_way_out(finished):
+    path = finished / "data" / "truth.safetensors"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-10])
+    try:
+        with pytest.raises(ValueError, match=r"truth\.safetensors is damaged.*--stage data"):
+            experiment.run_experiment(experiment.Args(preset="ci", out=finished.parents[2]))
+    finally:
+        path.write_bytes(whole)
