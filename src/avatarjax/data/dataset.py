@@ -27,8 +27,9 @@ from avatarjax.data.mesh_renderer import MeshRenderer
 from avatarjax.data.sequences import Recording
 from avatarjax.io import atomic, weights
 
-VERSION = 1
+VERSION = 2
 VIEWS = 50  # on the cylinder (UNICA B.1)
+LEAD_IN = 15  # idle frames before the report's script
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 
 
@@ -85,6 +86,9 @@ class Dataset:
     held_out_images: Images
 
 
+_FILES = {f"{field.name}.safetensors" for field in dataclasses.fields(Dataset)}
+
+
 def cylinder_cameras(size: int) -> Camera:
     """The 50 cameras of UNICA B.1, on a cylinder about the unit cube of a normalised pose, square pictures.
 
@@ -107,12 +111,17 @@ def build(folder: Path, spec: DatasetSpec, *, progress: bool = True) -> None:
     plans = {
         "train": sequences.transition_scripts(spec.transition_frames, spec.seed),
         "held_out": sequences.transition_scripts(spec.held_out_frames, spec.seed + 1),
-        "truth": np.asarray([spec.script], np.int32),
+        # The controller begins in steady motion: from standing, as a rollout does, takes a moment of idling first.
+        "truth": np.asarray([(0,) * LEAD_IN + spec.script], np.int32),
     }
-    motions = sequences.simulate(avatar, plans, spec.seed)
+    rng = np.random.default_rng(spec.seed + 3)
+    headings = {name: rng.integers(0, 4, len(scripts)) * (np.pi / 2) for name, scripts in plans.items()}
+    headings["truth"] = np.zeros(1)
+    motions = sequences.simulate(avatar, plans, headings, spec.seed)
     recordings = {}
     for name in tqdm(plans, desc="position maps", unit="set", disable=not progress):
         recordings[name] = sequences.record(avatar, atlas, plans[name], motions[name])
+    recordings["truth"] = jax.tree.map(lambda x: x[LEAD_IN:], recordings["truth"])
 
     painter = _Painter(avatar, atlas, spec)
     tables: dict[str, typing.Any] = {"atlas": atlas, **recordings, "standing": {"texels": standing}}
@@ -124,7 +133,6 @@ def build(folder: Path, spec: DatasetSpec, *, progress: bool = True) -> None:
         "standing pose",
         progress,
     )
-    rng = np.random.default_rng(spec.seed + 3)
     for name, poses in (("train", spec.image_poses), ("held_out", max(8, spec.image_poses // 6))):
         recording, motion = recordings[name], motions[name]
         length = motion.headings.shape[1]
@@ -232,10 +240,12 @@ def _manifest(folder: Path) -> dict[str, typing.Any]:
         raise ValueError(f"{folder} has no finished dataset (no manifest.json): build it with --stage data")
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-        if not {"version", "spec", "files"} <= manifest.keys():
-            raise KeyError("version, spec and files")
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged ({error}): build the dataset again with --stage data") from error
+        described = {name: (file["bytes"], file["sha256"]) for name, file in manifest["files"].items()}
+        missing = {"version", "spec"} - manifest.keys() | {"size"} - manifest["spec"].keys() | _FILES - described.keys()
+        if missing:
+            raise KeyError(", ".join(sorted(missing)))
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
+        raise ValueError(f"{path} is damaged ({error!r}): build the dataset again with --stage data") from error
     # A manifest is data: it may name files of its own folder only.
     for name in manifest["files"]:
         if Path(name).name != name or not name.endswith(".safetensors"):

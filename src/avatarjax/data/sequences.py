@@ -51,17 +51,22 @@ def transition_scripts(frames: int, seed: int, actions: int = len(ACTIONS)) -> I
     return np.asarray(scripts, np.int32)
 
 
-def simulate(avatar: AvatarMesh, plans: dict[str, Int[np.ndarray, "_n _f"]], seed: int) -> dict[str, Motion]:
+def simulate(
+    avatar: AvatarMesh,
+    plans: dict[str, Int[np.ndarray, "_n _f"]],
+    headings: dict[str, Float[np.ndarray, "_n"]],
+    seed: int,
+) -> dict[str, Motion]:
     """The controller's motion under each plan's scripts (n, f), with leading axes n, f.
 
-    Gait phases and the headings of scripts that start idle, one of the four key directions, are drawn by `seed`; all
-    plans run in one batch, padded to one length, so that the controller is compiled once.
+    `headings` (n,) yaw in radians is where a script looks that starts idle; gait phases are drawn by `seed`. All plans
+    run in one batch, padded to one length, so that the controller is compiled once.
     """
     longest = max(scripts.shape[1] for scripts in plans.values())
     batch = np.concatenate([np.pad(s, ((0, 0), (0, longest - s.shape[1])), mode="edge") for s in plans.values()])
     looping = clips.load_clips(avatar.rig)
     keys = jax.random.split(jax.random.key(seed), len(batch))
-    facing = np.random.default_rng(seed).integers(0, 4, len(batch)) * (np.pi / 2)
+    facing = np.concatenate([headings[name] for name in plans])
     run = jax.jit(jax.vmap(lambda a, k, h: locomotion.simulate(avatar.rig, looping, a, k, heading=h)))
     everything = run(jnp.asarray(batch), keys, jnp.asarray(facing, jnp.float32))
 

@@ -103,6 +103,8 @@ def _small() -> UnicaConfig:
         latent=LatentConfig(
             vae=VAEConfig(channels=(32, 64, 128), residual_blocks=1),
             denoiser=DenoiserConfig(channels=(64, 128, 256), residual_blocks=1, head_width=32, action_features=128),
+            from_last=True,
+            min_snr=5.0,
         ),
         coefficients=CoefficientConfig(components=96),
         appearance=AppearanceConfig(
@@ -126,7 +128,7 @@ def _small() -> UnicaConfig:
         unet_stage=StageConfig(4_500, 8, 3e-4),
         coefficients_stage=StageConfig(6_000, 128, 1e-3, ema=0.998),
         base_stage=StageConfig(400, 4, 2e-2),
-        appearance_stage=StageConfig(600, 1, 1e-3),
+        appearance_stage=StageConfig(400, 1, 1e-3),
     )
 
 
@@ -149,6 +151,8 @@ def _ci() -> UnicaConfig:
             vae=VAEConfig(channels=(16, 32, 32), residual_blocks=1),
             denoiser=DenoiserConfig(channels=(32, 64), residual_blocks=1, head_width=16, action_features=64),
             sample_steps=4,
+            from_last=True,
+            min_snr=5.0,
         ),
         coefficients=CoefficientConfig(components=32, width=192, depth=2, condition=64),
         appearance=AppearanceConfig(

@@ -33,6 +33,10 @@ class LatentConfig:
     guidance: float = 1.0  # code
     action_dropout: float = 0.1  # ours; usual for guidance
     context_noise: float = 0.1  # ours; the largest standard deviation, in units of the latents'
+    from_last: bool = False  # ours; the network's output is the change from frame t, from which the noise follows
+    min_snr: float = (
+        0.0  # ours; weight the loss by min(SNR, this) / SNR (Hang et al. 2023); 0 is the paper's plain loss
+    )
 
 
 @typing.no_type_check
@@ -120,9 +124,30 @@ def diffusion_loss(
     noisy = schedules.add_noise(signal, target, noise, timestep)
     dropped = jax.random.uniform(drop_key, (b,)) < config.action_dropout
     action = jnp.where(dropped, config.denoiser.null_action, action)
+    predicted = _predict_noise(config, dynamics, context, noisy, timestep, action)
+    weight = jnp.ones(b)
+    if config.min_snr > 0:
+        snr = signal[timestep] / (1 - signal[timestep])
+        weight = jnp.minimum(snr, config.min_snr) / snr
+    return jnp.mean(weight * jnp.mean((predicted - noise) ** 2, axis=(1, 2, 3)))
+
+
+def _predict_noise(
+    config: LatentConfig,
+    dynamics: LatentDynamics,
+    context: Float[Array, "b 3 u v l"],
+    noisy: Float[Array, "b u v l"],
+    timestep: Int[Array, "b"],
+    action: Int[Array, "b"],
+) -> Float[Array, "b u v l"]:
+    """The network's epsilon for a noisy fourth frame beside its context (UNICA Eq. 4)."""
     network = bind(Denoiser, config.denoiser, dynamics.denoiser)
-    predicted = network(jnp.concatenate([context, noisy[:, None]], axis=1), timestep, action)
-    return jnp.mean((predicted - noise) ** 2)
+    output = network(jnp.concatenate([context, noisy[:, None]], axis=1), timestep, action)
+    if not config.from_last:
+        return output
+    signal = schedules.alphas_cumprod(config.schedule, config.train_timesteps)[timestep].reshape(-1, 1, 1, 1)
+    clean = context[:, -1] + output
+    return (noisy - jnp.sqrt(signal) * clean) / jnp.sqrt(1 - signal)
 
 
 def sample(
@@ -137,10 +162,9 @@ def sample(
     b, frames, t, _ = context.shape
     latents = encode(config, atlas, dynamics, context.reshape(b * frames, t, 3))
     latents = latents.reshape(b, frames, *latents.shape[1:])
-    network = bind(Denoiser, config.denoiser, dynamics.denoiser)
 
     def predictor(action):
-        return lambda x, tau: network(jnp.concatenate([latents, x[:, None]], axis=1), jnp.full(b, tau), action)
+        return lambda x, tau: _predict_noise(config, dynamics, latents, x, jnp.full(b, tau), action)
 
     start = jax.random.normal(key, (b, *latents.shape[2:]))
     nobody = jnp.full_like(action, config.denoiser.null_action)
