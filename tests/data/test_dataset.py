@@ -1,0 +1,169 @@
+"""The dataset folder: built alike every time, and refused with the culprit's name where it is not whole."""
+
+import dataclasses
+import json
+import shutil
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from avatarjax import posmap
+from avatarjax.data import dataset
+
+
+@pytest.fixture
+def folder(tiny_folder, tmp_path):
+    """A copy to damage."""
+    return shutil.copytree(tiny_folder, tmp_path / "data")
+
+
+def edit(folder, change):
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    change(manifest)
+    path.write_text(json.dumps(manifest))
+
+
+def test_it_is_built_alike_every_time(tiny_folder, tiny_spec, tmp_path):
+    dataset.build(tmp_path, tiny_spec, progress=False)
+    assert dataset.fingerprint(tmp_path) == dataset.fingerprint(tiny_folder)
+
+
+def test_it_matches_its_spec(tiny_folder, tiny_spec):
+    assert dataset.matches(tiny_folder, tiny_spec)
+
+
+@pytest.mark.parametrize(
+    "change", [{"size": 64}, {"seed": 1}, {"script": (1, 2)}, {"image_views": 3}, {"held_out_frames": 61}]
+)
+def test_it_matches_no_other_spec(tiny_folder, tiny_spec, change):
+    assert not dataset.matches(tiny_folder, dataclasses.replace(tiny_spec, **change))
+
+
+def test_shapes_are_those_of_the_spec(tiny_data, tiny_spec):
+    texels = len(tiny_data.atlas.rows)
+    frames = 20 * tiny_spec.transition_frames
+    assert tiny_data.atlas.size == tiny_spec.size
+    assert tiny_data.train.texels.shape == (frames, texels, 3)
+    assert tiny_data.held_out.texels.shape == (frames, texels, 3)
+    assert tiny_data.truth.texels.shape == (len(tiny_spec.script), texels, 3)
+    assert tiny_data.standing_images.rgba.shape == (1, 2, 32, 32, 4)
+    assert tiny_data.train_images.rgba.shape == (2, 2, 32, 32, 4)
+    assert tiny_data.held_out_images.rgba.shape[1:] == (2, 32, 32, 4)
+
+
+def test_held_out_motion_is_the_same_transitions_in_another_way(tiny_data):
+    train, held = tiny_data.train, tiny_data.held_out
+    np.testing.assert_array_equal(train.actions[::60], held.actions[::60])
+    np.testing.assert_array_equal(train.actions[59::60], held.actions[59::60])
+    running = np.flatnonzero(train.actions[::60]) * 60
+    closest = np.abs(held.texels[running, None] - train.texels[None, running]).mean((2, 3)).min(1)
+    assert (closest > 1e-4).all()  # other phases of the gait; metres
+
+
+def test_pictures_show_the_texels_of_their_pose(tiny_data):
+    """A texel's place in the picture is opaque nearly always: texels lie on the surface (0.95: pixels are coarse)."""
+    upscaler = posmap.build_upscaler(tiny_data.atlas, 64)
+    for images in (tiny_data.standing_images, tiny_data.train_images, tiny_data.held_out_images):
+        cameras = dataset.cylinder_cameras(32)
+        for pose in range(len(images.texels)):
+            points = np.asarray(posmap.upscale(upscaler, jnp.asarray(images.texels[pose])))
+            low, high = points.min(0), points.max(0)
+            boxed = (points - (low + high) / 2) / (high - low).max()
+            for slot, view in enumerate(images.view[pose]):
+                seen = boxed @ np.asarray(cameras.world_to_camera[view, :3, :3]).T
+                seen = (seen + np.asarray(cameras.world_to_camera[view, :3, 3])) @ np.asarray(
+                    cameras.intrinsics[view]
+                ).T
+                column, row = np.floor(seen[:, :2] / seen[:, 2:]).astype(int).T
+                assert (images.rgba[pose, slot, row, column, 3] > 0).mean() > 0.95
+
+
+def test_transparent_pixels_are_outside_and_the_figure_is_coloured(tiny_data):
+    rgba = tiny_data.train_images.rgba
+    assert (rgba[:, :, [0, -1], 0, 3] == 0).all()
+    opaque = rgba[rgba[..., 3] == 255][:, :3].astype(float)
+    assert len(opaque) > 100 and opaque.std(0).min() > 10
+
+
+def test_cylinder_cameras_look_at_the_middle_from_one_distance():
+    cameras = dataset.cylinder_cameras(32)
+    rotation, shift = np.asarray(cameras.world_to_camera[:, :3, :3]), np.asarray(cameras.world_to_camera[:, :3, 3])
+    centres = -np.einsum("kji,kj->ki", rotation, shift)
+    np.testing.assert_allclose(np.linalg.norm(centres[:, [0, 2]], axis=1), 1.75, atol=1e-4)
+    assert centres[:, 1].min() >= -0.2 - 1e-5 and centres[:, 1].max() <= 0.6 + 1e-5
+    np.testing.assert_allclose(shift[:, :2], 0, atol=1e-5)
+    azimuth = np.sort(np.arctan2(centres[:, 0], centres[:, 2]))
+    gaps = np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi))
+    assert len(cameras.world_to_camera) == 50 and gaps.max() < 3 * 2 * np.pi / 50
+
+
+class TestDamage:
+    def test_a_truncated_file_is_named(self, folder):
+        path = folder / "held_out.safetensors"
+        path.write_bytes(path.read_bytes()[:-10])
+        with pytest.raises(ValueError, match=r"held_out\.safetensors is damaged.*--stage data"):
+            dataset.load(folder)
+
+    def test_a_flipped_bit_is_noticed(self, folder):
+        path = folder / "train.safetensors"
+        content = bytearray(path.read_bytes())
+        content[-100] ^= 1
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"train\.safetensors is damaged"):
+            dataset.load(folder)
+
+    def test_a_missing_file_is_named(self, folder):
+        (folder / "truth.safetensors").unlink()
+        with pytest.raises(ValueError, match=r"truth\.safetensors is missing: build it again"):
+            dataset.load(folder)
+
+    def test_a_folder_without_manifest_is_unfinished(self, folder, tiny_spec):
+        (folder / "manifest.json").unlink()
+        assert not dataset.matches(folder, tiny_spec)
+        with pytest.raises(ValueError, match="no finished dataset"):
+            dataset.load(folder)
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "",
+            '{"version": 1',
+            "[]",
+            "3",
+            '{"version": 1, "spec": {}}',
+            '{"version": 1, "spec": {}, "files": []}',
+            '{"version": 1, "spec": {"size": 32}, "files": {}}',
+            '{"version": 1, "spec": [], "files": {"a": 3}}',
+        ],
+    )
+    def test_a_damaged_manifest_is_named(self, folder, tiny_spec, text):
+        (folder / "manifest.json").write_text(text)
+        assert not dataset.matches(folder, tiny_spec)
+        with pytest.raises(ValueError, match=r"manifest\.json is damaged.*--stage data"):
+            dataset.load(folder)
+
+    @pytest.mark.parametrize("name", ["../secret.safetensors", "/etc/passwd", "sub/x.safetensors", "other.txt"])
+    def test_a_manifest_that_names_other_files_is_refused(self, folder, tiny_spec, name):
+        edit(folder, lambda m: m["files"].update({name: {"bytes": 0, "sha256": ""}}))
+        assert not dataset.matches(folder, tiny_spec)
+        with pytest.raises(ValueError, match=r"manifest\.json names .*not a file of this dataset"):
+            dataset.load(folder)
+
+    def test_another_version_is_refused(self, folder, tiny_spec):
+        edit(folder, lambda m: m.update(version=99))
+        assert not dataset.matches(folder, tiny_spec)
+        with pytest.raises(ValueError, match=r"data of version 99.*build it again"):
+            dataset.load(folder)
+
+
+def test_other_data_have_another_fingerprint(folder, tiny_folder):
+    edit(folder, lambda m: m["files"]["train.safetensors"].update(sha256="0" * 64))
+    assert dataset.fingerprint(folder) != dataset.fingerprint(tiny_folder)
+
+
+@pytest.mark.parametrize("views", [{"image_views": 0}, {"standing_views": 51}])
+def test_impossible_numbers_of_views_are_refused(tiny_spec, views):
+    with pytest.raises(ValueError, match="1 to 50 views"):
+        dataclasses.replace(tiny_spec, **views)

@@ -1,0 +1,109 @@
+"""Scripts of key presses, windows of frames, and turns."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from avatarjax import posmap
+from avatarjax.data import avatars, sequences
+
+
+@pytest.fixture(scope="module", params=[60, 150])
+def scripts(request):
+    return sequences.transition_scripts(request.param, 0)
+
+
+def test_every_ordered_pair_of_actions_has_one_sequence(scripts):
+    pairs = {(int(s[0]), int(s[-1])) for s in scripts}
+    assert len(scripts) == 20
+    assert pairs == {(a, b) for a in range(5) for b in range(5) if a != b}
+
+
+def test_a_sequence_changes_its_key_once(scripts):
+    assert ((np.diff(scripts, axis=1) != 0).sum(1) == 1).all()
+
+
+def test_the_source_is_steady_for_a_third_and_the_target_held_for_half(scripts):
+    frames = scripts.shape[1]
+    turn = (scripts == scripts[:, :1]).sum(1)
+    assert (turn >= frames // 3).all() and (turn < frames // 3 + max(1, frames // 12)).all()
+    assert (frames - turn >= frames // 2).all()
+
+
+def test_the_turning_point_varies_and_depends_on_the_seed_alone():
+    one, same, other = (sequences.transition_scripts(120, seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(one, same)
+    assert len(set((one == one[:, :1]).sum(1))) > 3
+    assert (one != other).any()
+
+
+def test_too_short_sequences_are_refused():
+    with pytest.raises(ValueError, match=r"at least 60 frames.*got 59"):
+        sequences.transition_scripts(59, 0)
+
+
+@pytest.mark.parametrize("length", [1, 2, 4, 9])
+def test_windows_are_all_those_inside_one_sequence(length):
+    sequence = np.repeat([0, 1, 2, 3], [5, 3, 4, 12]).astype(np.int32)
+    expected = [e for e in range(length - 1, 24) if len(set(sequence[e - length + 1 : e + 1])) == 1]
+    np.testing.assert_array_equal(sequences.group_ends(sequence, length), expected)
+
+
+def test_windows_longer_than_everything_are_none():
+    assert len(sequences.group_ends(np.zeros(3, np.int32), 4)) == 0
+
+
+class TestTurning:
+    actions = np.array([1] * 10 + [2] * 10 + [3] * 4 + [1] * 6, np.int32)
+    sequence = np.array([0] * 20 + [1] * 10, np.int32)
+
+    def test_frames_reached_after_the_key_change_count(self):
+        """Frame 10 still shows the old key: actions[10] drives it to frame 11."""
+        near = sequences.turning(self.actions, self.sequence, (0, 3))
+        np.testing.assert_array_equal(np.flatnonzero(near), [11, 12, 13, 25, 26, 27])
+
+    def test_a_window_may_begin_before_the_change(self):
+        near = sequences.turning(self.actions, self.sequence, (-2, 1))
+        np.testing.assert_array_equal(np.flatnonzero(near), [9, 10, 11, 23, 24, 25])
+
+    def test_a_window_stays_inside_its_sequence(self):
+        near = sequences.turning(self.actions, self.sequence, (-15, 100))
+        assert near.all()
+        near = sequences.turning(self.actions[:25], np.zeros(25, np.int32), (0, 100))
+        np.testing.assert_array_equal(np.flatnonzero(near), np.arange(11, 25))
+        alone = np.array([0] * 20 + [1] * 10, np.int32)
+        near = sequences.turning(np.array([1] * 10 + [2] * 20, np.int32), alone, (-50, 50))
+        np.testing.assert_array_equal(np.flatnonzero(near), np.arange(20))
+
+    def test_another_sequence_with_another_key_is_no_turn(self):
+        actions = np.array([1] * 5 + [2] * 5, np.int32)
+        assert not sequences.turning(actions, np.array([0] * 5 + [1] * 5, np.int32), (0, 25)).any()
+
+
+class TestRecording:
+    def test_texels_are_relative_to_the_root_of_their_frame(self, tiny_data):
+        roots = np.einsum("t,ftc->fc", tiny_data.atlas.waist, tiny_data.train.texels)
+        np.testing.assert_allclose(roots, 0, atol=1e-5)
+
+    def test_frames_know_their_key_and_sequence(self, tiny_data, tiny_spec):
+        scripts = sequences.transition_scripts(tiny_spec.transition_frames, tiny_spec.seed)
+        np.testing.assert_array_equal(tiny_data.train.actions, scripts.reshape(-1))
+        np.testing.assert_array_equal(tiny_data.train.sequence, np.repeat(np.arange(20), scripts.shape[1]))
+
+    @pytest.mark.parametrize("action, direction", [(1, (0, 1)), (2, (0, -1)), (3, (1, 0)), (4, (-1, 0))])
+    def test_the_root_walks_where_the_key_points(self, tiny_data, action, direction):
+        train = tiny_data.train
+        for k in range(20):
+            rows = np.flatnonzero((train.sequence == k) & (train.actions == action))
+            if len(rows) and rows[-1] % 60 == 59:
+                step = (train.roots[rows[-1]] - train.roots[rows[-10]])[[0, 2]]
+                np.testing.assert_allclose(step / np.linalg.norm(step), direction, atol=0.1)
+
+    def test_the_figure_stands_on_the_floor(self, tiny_data):
+        world = tiny_data.train.texels[..., 1] + tiny_data.train.roots[:, None, 1]
+        assert -0.03 < world.min() < 0.1
+        assert 1.4 < np.ptp(tiny_data.standing[:, 1]) < 2.1
+
+    def test_standing_texels_are_those_of_the_standing_pose(self, tiny_data):
+        expected = posmap.encode(tiny_data.atlas, jnp.asarray(avatars.standing_pose(avatars.build("cowgirl"))))
+        np.testing.assert_allclose(tiny_data.standing, expected, atol=1e-5)
