@@ -1,0 +1,156 @@
+"""The contract of an avatar that answers keys: pure, and the same by steps, by scan, in batches and when jitted."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from avatarjax import posmap, unica
+from avatarjax.posmap import pca
+from avatarjax.unica.latent import LatentDynamics
+
+ACTIONS = np.array([1, 1, 3, 0], np.int32)
+roll = jax.jit(unica.rollout, static_argnames="gaussians")
+geometry = functools.partial(roll, gaussians=False)
+one_step = jax.jit(unica.step)
+
+
+def assert_same(a, b, atol=0.0):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(a), jax.tree.leaves(b), strict=True):
+        if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x, y = jax.random.key_data(x), jax.random.key_data(y)
+        np.testing.assert_allclose(x, y, atol=atol, rtol=atol, err_msg=jax.tree_util.keystr(path))
+
+
+@pytest.fixture(scope="module")
+def cached():
+    return {}
+
+
+@pytest.fixture
+def start(avatar, key):
+    return unica.reset(avatar, key)
+
+
+@pytest.fixture
+def rolled(avatar, start, cached):
+    """The state and frames of one rollout with Gaussians, once for each model."""
+    if avatar.config.dynamics not in cached:
+        cached[avatar.config.dynamics] = roll(avatar, start, ACTIONS)
+    return cached[avatar.config.dynamics]
+
+
+def texels_of(avatar, frames):
+    return jax.vmap(lambda m: posmap.from_map(avatar.atlas, m))(frames.posmap)
+
+
+def test_shapes_and_finiteness(avatar, rolled):
+    _, frames = rolled
+    n = len(avatar.upscaler.rows)
+    assert frames.posmap.shape == (4, 32, 32, 3) and frames.root.shape == (4, 3)
+    assert frames.gaussians.means.shape == (4, n, 3) and frames.gaussians.quats.shape == (4, n, 4)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(frames))
+
+
+def test_reset_stands_three_times_at_the_standing_root(avatar, start):
+    np.testing.assert_allclose(start.offset, posmap.root(avatar.atlas, avatar.standing), atol=1e-6)
+    newest = jax.tree.leaves(start.context)
+    for leaf in newest:
+        np.testing.assert_array_equal(leaf, np.broadcast_to(leaf[-1], leaf.shape))
+
+
+def test_a_rollout_is_repeated_steps(avatar, start, rolled):
+    state, frames = start, []
+    for action in ACTIONS:
+        state, frame = one_step(avatar, state, jnp.asarray(action))
+        frames.append(frame)
+    assert_same(jax.tree.map(lambda *x: jnp.stack(x), *frames), rolled[1], 2e-4)
+    assert_same(state, rolled[0], 2e-4)
+
+
+def test_it_is_deterministic(avatar, start, rolled):
+    assert_same(roll(avatar, start, ACTIONS), rolled)
+
+
+def test_states_of_one_avatar_can_be_batched(avatar, start, rolled):
+    states = jax.vmap(lambda k: unica.reset(avatar, k))(jax.random.split(jax.random.key(9), 2))
+    states = states.replace(key=jnp.stack([start.key, states.key[1]]))
+    batched = jax.jit(jax.vmap(lambda s: unica.rollout(avatar, s, jnp.asarray(ACTIONS), gaussians=False)[1]))(states)
+    np.testing.assert_allclose(batched.root[0], rolled[1].root, atol=1e-4)
+    np.testing.assert_allclose(batched.posmap[0], rolled[1].posmap, atol=1e-4)
+    assert np.abs(batched.posmap[1] - batched.posmap[0]).max() > 1e-5
+
+
+def test_without_gaussians_the_geometry_is_the_same(avatar, start, rolled):
+    state, frames = geometry(avatar, start, ACTIONS)
+    assert frames.gaussians is None
+    assert_same(frames.replace(gaussians=None), rolled[1].replace(gaussians=None), 1e-5)
+    assert_same(state, rolled[0], 1e-5)
+
+
+def test_the_action_matters(avatar, start, rolled):
+    other = geometry(avatar, start, np.array([2, 1, 3, 0], np.int32))[1]
+    assert np.abs(other.posmap[0] - rolled[1].posmap[0]).max() > 1e-5
+
+
+def test_movement_accumulates(avatar, start, rolled):
+    """Eq. 7: the root in the world is where it was, plus its displacement in normalised space over s."""
+    offset = np.asarray(start.offset, np.float64)
+    for texels, root in zip(texels_of(avatar, rolled[1]), rolled[1].root, strict=True):
+        displacement = np.asarray(avatar.atlas.waist, np.float64) @ np.asarray(texels, np.float64) - 0.5
+        offset = offset + displacement / float(avatar.atlas.scale)
+        np.testing.assert_allclose(root, offset, atol=1e-4)
+    np.testing.assert_allclose(rolled[0].offset, offset, atol=1e-4)
+
+
+def test_the_newest_context_frame_is_the_origin(avatar, rolled):
+    context = rolled[0].context
+    if isinstance(avatar.dynamics, LatentDynamics):
+        np.testing.assert_allclose(posmap.root(avatar.atlas, context[-1]), 0.5, atol=1e-5)
+    else:
+        np.testing.assert_allclose(context.root[-1, :2], 0, atol=1e-6)
+
+
+def test_context_frames_keep_their_distances(avatar, rolled):
+    """Renormalising moves all three frames alike (Eq. 8): their roots differ as the world roots do."""
+    context, world = rolled[0].context, np.asarray(rolled[1].root[-3:])
+    if isinstance(avatar.dynamics, LatentDynamics):
+        roots = np.stack([posmap.root(avatar.atlas, c) for c in context]) / float(avatar.atlas.scale)
+        np.testing.assert_allclose(np.diff(roots, axis=0), np.diff(world, axis=0), atol=1e-4)
+    else:
+        np.testing.assert_allclose(np.diff(context.root[:, :2], axis=0), np.diff(world[:, [0, 2]], axis=0), atol=1e-4)
+
+
+def test_a_start_elsewhere_only_moves_the_ground(avatar, start, rolled):
+    shift = jnp.asarray([100.0, 0.0, -50.0])
+    moved = geometry(avatar, start.replace(offset=start.offset + shift), ACTIONS)[1]
+    np.testing.assert_allclose(moved.root - shift[None], rolled[1].root, atol=1e-3)
+    np.testing.assert_allclose(moved.posmap, rolled[1].posmap, atol=1e-5)
+
+
+def test_dressing_a_frame_gives_its_gaussians(avatar, rolled):
+    frame = jax.tree.map(lambda x: x[2], rolled[1])
+    assert_same(jax.jit(unica.dress)(avatar, frame.replace(gaussians=None)), frame.gaussians, 2e-4)
+
+
+def test_gaussians_are_where_the_aligned_texels_are_in_the_world(avatar, rolled):
+    """Their centroid is exactly that of the upscaled points: a least-squares similarity keeps centroids."""
+    texels = texels_of(avatar, rolled[1])[3]
+    points = posmap.upscale(avatar.upscaler, pca.align(avatar.pca, texels))
+    origin = rolled[1].root[2]  # the root of the frame before
+    world = posmap.denormalize(avatar.atlas, points, origin)
+    np.testing.assert_allclose(rolled[1].gaussians.means[3].mean(0), world.mean(0), atol=1e-3)
+
+
+def test_info_tells_the_distance_to_the_basis_and_the_lowest_texel(avatar, start, rolled):
+    texels = np.asarray(texels_of(avatar, rolled[1])[0], np.float64)
+    scale, basis = float(avatar.atlas.scale), np.asarray(avatar.pca.basis, np.float64)
+    centred = texels.reshape(-1) - np.asarray(avatar.pca.mean)
+    outside = (centred - basis.T @ (basis @ centred)).reshape(-1, 3) / scale
+    info = rolled[1].info
+    assert float(info.pca_residual[0]) == pytest.approx(np.sqrt((outside**2).sum(1).mean()), rel=1e-2, abs=1e-4)
+    lowest = (texels[:, 1].min() - 0.5) / scale + float(start.offset[1])
+    assert float(info.ground[0]) == pytest.approx(lowest, abs=1e-4)
