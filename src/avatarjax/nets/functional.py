@@ -21,7 +21,7 @@ def init(cls: type[nnx.Module], config: typing.Any, key: Key[Array, ""]) -> Para
 
 def shapes(cls: type[nnx.Module], config: typing.Any) -> Params:
     """The parameter tree of `cls(config)` as `jax.ShapeDtypeStruct`s, without allocating or computing anything."""
-    return jax.eval_shape(lambda k: _pure(cls(config, rngs=nnx.Rngs(k))), jax.random.key(0))
+    return jax.eval_shape(lambda: _pure(cls(config, rngs=_OneKey(0))))
 
 
 def count(params: Params) -> int:
@@ -31,9 +31,16 @@ def count(params: Params) -> int:
 
 def bind(cls: type[nnx.Module], config: typing.Any, params: Params) -> typing.Any:
     """The module `cls(config)` with these parameters: call it, or its methods, inside the jitted function."""
-    graph, state = nnx.split(nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0))))
+    graph, state = nnx.split(nnx.eval_shape(lambda: cls(config, rngs=_OneKey(0))))
     nnx.replace_by_pure_dict(state, params)
     return nnx.merge(graph, state)
+
+
+class _OneKey(nnx.Rngs):
+    """The same key for every parameter, where only shapes count: Flax' counting streams trace in quadratic time."""
+
+    def params(self) -> Key[Array, ""]:
+        return jax.random.key(0)
 
 
 def _pure(module: nnx.Module) -> Params:
