@@ -52,13 +52,18 @@ def weights(state: TrainState) -> Params:
 
 
 def make_step(
-    loss: Loss, transform: optax.GradientTransformation, *, decay: float = 0.0
+    loss: Loss,
+    transform: optax.GradientTransformation,
+    *,
+    decay: float = 0.0,
+    hold: Callable[[Params, Params, Batch], Params] | None = None,
 ) -> Callable[[TrainState, Batch], tuple[TrainState, Metrics]]:
     """A jitted `(state, batch) -> (state, metrics)` with donated state.
 
-    `loss(params, key, batch)` returns the loss and more metrics; `decay` is that of the average of the weights. The
-    metrics hold the loss and the gradient norm; a step whose gradient is not finite changes nothing and counts in
-    `skipped`.
+    `loss(params, key, batch)` returns the loss and more metrics; `decay` is that of the average of the weights;
+    `hold(new, old, batch)` may put back parameters that must not move: a zero gradient alone does not stop Adam's
+    momentum. The metrics hold the loss and the gradient norm; a step whose gradient is not finite changes nothing and
+    counts in `skipped`.
     """
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
@@ -69,6 +74,8 @@ def make_step(
         gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
         updates, opt_state = transform.update(gradient, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
+        if hold is not None:
+            params = hold(params, state.params, batch)
         keep = lambda new, old: jax.tree.map(lambda n, o: jnp.where(good, n, o), new, old)  # noqa: E731
         params, opt_state = keep(params, state.params), keep(opt_state, state.opt_state)
         average = state.average

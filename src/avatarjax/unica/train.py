@@ -58,10 +58,11 @@ def _train(
     loss: Loss,
     initial: Params,
     batch_at: Callable[[int], typing.Any],
+    hold: Callable[[Params, Params, typing.Any], Params] | None = None,
 ) -> Params:
     transform = optimiser(stage.learning_rate, stage.steps)
     state: TrainState = new_state(initial, transform, run.key(name), averaged=stage.ema > 0)
-    step = make_step(loss, transform, decay=stage.ema)
+    step = make_step(loss, transform, decay=stage.ema, hold=hold)
     mark = hashlib.sha256(f"{run.data} {run.seed} {stage} {config}".encode()).hexdigest()[:12]
     return weights(fit(step, state, batch_at, stage.steps, run.folder, name, fingerprint=mark))
 
@@ -145,7 +146,11 @@ def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynami
         groups, actions = batch["groups"], batch["actions"]
         return latent.diffusion_loss(config.latent, batch["atlas"], dynamics, key, groups, actions), {}
 
-    return start.replace(denoiser=_train(run, "unet", stage, config, loss, start.denoiser, batch_at))
+    def hold(new, old, batch):
+        table = jnp.where(batch["learn_actions"], new["action_table"]["embedding"], old["action_table"]["embedding"])
+        return {**new, "action_table": {"embedding": table}}
+
+    return start.replace(denoiser=_train(run, "unet", stage, config, loss, start.denoiser, batch_at, hold))
 
 
 def coefficient_frames(data: Dataset, recording: typing.Any) -> tuple[np.ndarray, np.ndarray]:
