@@ -42,6 +42,8 @@ def new_state(
     params: Params, transform: optax.GradientTransformation, key: Key[Array, ""], *, averaged: bool = False
 ) -> TrainState:
     """A state before its first step. `averaged` keeps an exponential moving average of the parameters."""
+    # Steps donate the state: copied, the caller's arrays stay. Weak types would make the second step compile anew.
+    params = jax.tree.map(lambda x: jnp.array(x, jnp.asarray(x).dtype), params)
     average = jax.tree.map(jnp.copy, params) if averaged else None
     return TrainState(params, average, transform.init(params), key, jnp.zeros((), jnp.int32))
 
