@@ -83,6 +83,31 @@ def test_the_state_is_donated(key, step):
     assert state.params["w"].is_deleted()
 
 
+def test_the_callers_parameters_survive(key, step):
+    params = {"w": jnp.zeros(3)}
+    step(new_state(params, SGD, key), TARGET)
+    np.testing.assert_array_equal(params["w"], 0)
+
+
+def test_one_compilation_serves_all_steps(key):
+    """Also from parameters of a weak type, which every step would make strong."""
+    step = make_step(quadratic, SGD, decay=0.5)
+    state = new_state({"w": jnp.full(3, 1.0)}, SGD, key, averaged=True)
+    for _ in range(3):
+        state, _ = step(state, TARGET)
+    assert step._cache_size() == 1
+
+
+def test_held_parameters_do_not_move(key):
+    def hold(new, old, batch):
+        return jax.tree.map(lambda n, o: jnp.where(batch > 0, n, o), new, old)
+
+    step = make_step(quadratic, SGD, hold=hold)
+    target = np.array([1.0, -2.0, 3.0], np.float32)
+    state, _ = step(fresh(key), target)
+    np.testing.assert_allclose(state.params["w"], [0.2, 0, 0.6], rtol=1e-6)
+
+
 def test_every_step_has_its_own_randomness(key):
     step = make_step(lambda p, k, b: (jnp.sum(p["w"]) + jax.random.normal(k), {}), SGD)
     state, losses = fresh(key), []
