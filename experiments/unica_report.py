@@ -126,7 +126,7 @@ def _page(
     )
     page.media(folder / "components.png", "Alignment error against the number of components (as UNICA Fig. B).")
     page.media(folder / "drift.png", "Drift: the rollout, and held-out recordings for comparison.")
-    page.text(f"Height of the lowest point by frame of the rollout, mm (a trend is vertical drift): {measured['ground_mm']}.")
+    page.text(f"Height of the lowest point by frame, mm (a trend is vertical drift): {measured['ground_mm']}.")
 
     page.heading("What is poor")
     for line in _poor(rows, verdicts, measured):

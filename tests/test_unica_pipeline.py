@@ -11,7 +11,6 @@ from avatarjax.unica import config as configs
 from avatarjax.unica.config import StageConfig
 from experiments import unica as experiment
 
-
 CI = configs.preset("ci")
 
 

@@ -59,7 +59,7 @@ def paint_atlas(
         colour[mine] = painter(position[mine], normal[mine], own[mine])
     atlas = np.zeros((size, size, 3), np.uint8)
     atlas[covered] = np.clip(np.round(colour), 0, 255)
-    nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    nearest = np.asarray(ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True))
     return atlas[nearest[0], nearest[1]]
 
 

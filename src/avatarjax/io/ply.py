@@ -77,7 +77,7 @@ def read_ply(path: str | os.PathLike) -> Gaussians:
             f"{path} is truncated: {count} Gaussians take {count * dtype.itemsize} bytes, found {len(data)}"
         )
     vertices = np.frombuffer(data, dtype)
-    rest = [f"f_rest_{k}" for k in range(sum(name.startswith("f_rest_") for name in dtype.names))]
+    rest = [f"f_rest_{k}" for k in range(sum(name.startswith("f_rest_") for name in dtype.names or ()))]
     sh = _gather(vertices, rest).reshape(count, 3, len(rest) // 3).transpose(0, 2, 1) if rest else None
     return Gaussians(
         means=jnp.asarray(_gather(vertices, _POSITION)),

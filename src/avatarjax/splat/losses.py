@@ -40,8 +40,8 @@ def ssim(a: Float[Array, "h w c"], b: Float[Array, "h w c"]) -> Float[Array, ""]
 def _blur(x: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:
     # Sums of shifted images: XLA's depthwise convolution is eight times as slow on CPU.
     h, w = x.shape[0] - _WINDOW + 1, x.shape[1] - _WINDOW + 1
-    x = sum(k * x[i : i + h] for i, k in enumerate(_KERNEL))
-    return sum(k * x[:, i : i + w] for i, k in enumerate(_KERNEL))
+    x = sum((k * x[i : i + h] for i, k in enumerate(_KERNEL)), jnp.zeros((), x.dtype))
+    return sum((k * x[:, i : i + w] for i, k in enumerate(_KERNEL)), jnp.zeros((), x.dtype))
 
 
 def _blur_bwd(_, cotangent):

@@ -31,7 +31,7 @@ class Windows:
         origin = self.recording.roots[frames[:, CENTRE]]
         shift = self.recording.roots[frames] - origin[:, None]
         texels = scale * (self.recording.texels[frames] + shift[:, :, None]) + 0.5
-        return texels.astype(np.float32), self.recording.actions[frames[:, CENTRE]]
+        return np.asarray(texels, np.float32), np.asarray(self.recording.actions[frames[:, CENTRE]])
 
     def frames(self, chosen: Int[np.ndarray, "b"]) -> Int[np.ndarray, "b length"]:
         """Frame numbers of windows."""

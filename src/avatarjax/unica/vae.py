@@ -14,12 +14,17 @@ from avatarjax.nets.blocks import GROUPS, Attention, ResidualBlock, conv, double
 
 @dataclasses.dataclass(frozen=True)
 class VAEConfig:
-    """Sizes; every stage but the last halves the map, so three stages downsample by 4 and four by 8 (the paper's)."""
+    """Sizes; every stage but the last halves the map, so three stages downsample by 4 and four by 8 (the paper's).
+
+    `positions` (ours) is the side of the map if each of its places gets a learned embedding in encoder and decoder: a
+    place is always the same spot of the body, which a convolution cannot know. 0 is the paper's network.
+    """
 
     channels: tuple[int, ...] = (128, 256, 512, 512)
     residual_blocks: int = 2
     latent_channels: int = 4
     data_channels: int = 3
+    positions: int = 0
 
     @property
     def downsampling(self) -> int:
@@ -42,6 +47,17 @@ class Middle(nnx.Module):
         return self.block2(x + self.attention(tokens).reshape(x.shape))
 
 
+class Places(nnx.Module):
+    """A learned gain and shift a place of a (side, side) map, neutral at first."""
+
+    def __init__(self, side: int, channels: int):
+        self.gain = nnx.Param(jnp.ones((side, side, channels)))
+        self.shift = nnx.Param(jnp.zeros((side, side, channels)))
+
+    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
+        return x * self.gain[...][None] + self.shift[...][None]
+
+
 class VAE(nnx.Module):
     """Encoder to the mean and log-variance of a Gaussian latent, and decoder back to maps."""
 
@@ -49,6 +65,13 @@ class VAE(nnx.Module):
         self.config = config
         first, last = config.channels[0], config.channels[-1]
         self.enter = conv(config.data_channels, first, rngs=rngs)
+        self.places = nnx.Dict()
+        if config.positions:
+            coarse = config.positions // config.downsampling
+            self.places["encoder_fine"] = Places(config.positions, first)
+            self.places["encoder_coarse"] = Places(coarse, last)
+            self.places["decoder_coarse"] = Places(coarse, last)
+            self.places["decoder_fine"] = Places(config.positions, first)
         self.down, self.shrink = nnx.List(), nnx.List()
         width = first
         for stage, channels in enumerate(config.channels):
@@ -75,25 +98,29 @@ class VAE(nnx.Module):
 
     def encode(self, x: Float[Array, "b h w c"]) -> tuple[Float[Array, "b u v l"], Float[Array, "b u v l"]]:
         """Mean and log-variance of the latent of maps in [-1, 1]."""
-        x = self.enter(x)
+        x = self._place("encoder_fine", self.enter(x))
         for stage in range(len(self.config.channels)):
             for k in range(self.config.residual_blocks):
                 x = self.down[stage * self.config.residual_blocks + k](x)
             if stage < len(self.shrink):
                 x = self.shrink[stage](x)
-        x = self.to_moments(jax.nn.silu(self.encoder_norm(self.encoder_middle(x))))
+        x = self.encoder_middle(self._place("encoder_coarse", x))
+        x = self.to_moments(jax.nn.silu(self.encoder_norm(x)))
         mean, log_variance = jnp.split(x, 2, axis=-1)
         return mean, jnp.clip(log_variance, -30.0, 20.0)
 
     def decode(self, z: Float[Array, "b u v l"]) -> Float[Array, "b h w c"]:
         """Maps in [-1, 1] (not clipped) of latents."""
-        x = self.decoder_middle(self.from_latent(z))
+        x = self.decoder_middle(self._place("decoder_coarse", self.from_latent(z)))
         for stage in range(len(self.config.channels)):
             for k in range(self.config.residual_blocks):
                 x = self.up[stage * self.config.residual_blocks + k](x)
             if stage < len(self.grow):
                 x = self.grow[stage](double(x))
-        return self.leave(jax.nn.silu(self.decoder_norm(x)))
+        return self.leave(jax.nn.silu(self.decoder_norm(self._place("decoder_fine", x))))
+
+    def _place(self, name: str, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
+        return self.places[name](x) if name in self.places else x
 
 
 def sample_latent(
