@@ -1,0 +1,148 @@
+"""Maps to images to latents, and the loss of the fourth frame's noise."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from avatarjax import posmap
+from avatarjax.diffusion import schedules
+from avatarjax.unica import batches, latent
+
+
+@pytest.fixture(scope="module")
+def groups(tiny_data):
+    windows = batches.windows(tiny_data.train, 4, (0, 25))
+    return jnp.asarray(windows.groups(np.array([5, 300]), float(tiny_data.atlas.scale))[0])
+
+
+def test_images_come_back_as_texels(tiny_data, latent_dynamics, groups):
+    images = latent.to_images(tiny_data.atlas, latent_dynamics, groups[0])
+    np.testing.assert_allclose(latent.from_images(tiny_data.atlas, latent_dynamics, images), groups[0], atol=1e-6)
+
+
+def test_the_mean_map_is_an_empty_image(tiny_data, latent_dynamics):
+    images = latent.to_images(tiny_data.atlas, latent_dynamics, latent_dynamics.map_mean[None])
+    np.testing.assert_array_equal(images, 0)
+
+
+def test_the_background_of_decoded_images_is_ignored(tiny_data, latent_dynamics, groups):
+    images = latent.to_images(tiny_data.atlas, latent_dynamics, groups[0])
+    painted = jnp.where(tiny_data.atlas.mask[None, :, :, None], images, 99.0)
+    np.testing.assert_allclose(latent.from_images(tiny_data.atlas, latent_dynamics, painted), groups[0], atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def stages(config, tiny_data, latent_dynamics, groups):
+    """Latents with the statistics of `latent_dynamics`, and with none."""
+    encode = jax.jit(latent.encode, static_argnums=0)
+    plain = latent_dynamics.replace(latent_mean=jnp.zeros(4), latent_scale=jnp.ones(4))
+    return [encode(config.latent, tiny_data.atlas, d, groups[0]) for d in (latent_dynamics, plain)]
+
+
+def test_latents_are_brought_to_unit_size(config, latent_dynamics, stages):
+    scaled, plain = (np.asarray(x) for x in stages)
+    side = config.size // config.latent.vae.downsampling
+    assert scaled.shape == (4, side, side, 4)
+    expected = (plain - np.asarray(latent_dynamics.latent_mean)) / np.asarray(latent_dynamics.latent_scale)
+    np.testing.assert_allclose(scaled, expected, atol=1e-4)
+
+
+class TestLoss:
+    """With a network that is replaced by a closed form."""
+
+    @pytest.fixture
+    def settings(self, config):
+        return dataclasses.replace(config.latent, from_last=False, min_snr=0.0, context_noise=0.0)
+
+    def loss(self, monkeypatch, settings, tiny_data, dynamics, groups, network):
+        bind = latent.bind
+        monkeypatch.setattr(latent, "bind", lambda cls, c, p: network if cls is latent.Denoiser else bind(cls, c, p))
+        jitted = jax.jit(
+            lambda key, g: latent.diffusion_loss(settings, tiny_data.atlas, dynamics, key, g, jnp.array([1, 2]))
+        )
+        return jitted(jax.random.key(3), groups)
+
+    def test_the_exact_noise_has_no_loss(self, monkeypatch, settings, tiny_data, latent_dynamics, groups):
+        target = latent.encode(settings, tiny_data.atlas, latent_dynamics, groups[:, 3])
+        signal = schedules.alphas_cumprod(settings.schedule, settings.train_timesteps)
+
+        def knows(z, timestep, action):
+            a = signal[timestep].reshape(-1, 1, 1, 1)
+            return (z[:, 3] - jnp.sqrt(a) * target) / jnp.sqrt(1 - a)
+
+        loss = self.loss(monkeypatch, settings, tiny_data, latent_dynamics, groups, knows)
+        assert float(loss) == pytest.approx(0, abs=1e-4)
+
+    def test_no_answer_costs_the_variance_of_the_noise(self, monkeypatch, settings, tiny_data, latent_dynamics, groups):
+        loss = self.loss(
+            monkeypatch, settings, tiny_data, latent_dynamics, groups, lambda z, t, a: jnp.zeros_like(z[:, 3])
+        )
+        assert float(loss) == pytest.approx(1, abs=0.15)
+
+    def test_the_context_is_clean_but_for_its_own_noise(
+        self, monkeypatch, settings, tiny_data, latent_dynamics, groups
+    ):
+        """Only the fourth frame is noised by the schedule: a network that compares the context sees the data."""
+        context = latent.encode(settings, tiny_data.atlas, latent_dynamics, groups[:, :3].reshape(6, -1, 3))
+        context = context.reshape(2, 3, *context.shape[1:])
+
+        def spread(z, timestep, action):
+            return jnp.full_like(z[:, 3], jnp.abs(z[:, :3] - context).max())
+
+        quiet = self.loss(monkeypatch, settings, tiny_data, latent_dynamics, groups, spread)
+        silent = self.loss(
+            monkeypatch, settings, tiny_data, latent_dynamics, groups, lambda z, t, a: jnp.zeros_like(z[:, 3])
+        )
+        assert float(quiet) == pytest.approx(float(silent), abs=1e-3)
+
+    @pytest.mark.parametrize("share", [0.0, 1.0])
+    def test_actions_are_dropped_to_the_null_action(
+        self, monkeypatch, settings, tiny_data, latent_dynamics, groups, share
+    ):
+        settings = dataclasses.replace(settings, action_dropout=share)
+        loss = self.loss(
+            monkeypatch,
+            settings,
+            tiny_data,
+            latent_dynamics,
+            groups,
+            lambda z, t, a: 1e3 * jnp.ones_like(z[:, 3]) * (a == settings.denoiser.null_action)[:, None, None, None],
+        )
+        assert (float(loss) > 1e5) == (share == 1.0)
+
+
+def test_sampling_decodes_the_point_that_the_noise_leads_to(
+    monkeypatch, config, tiny_data, latent_dynamics, groups, stages
+):
+    """A network that knows the fourth latent exactly: the sample is that latent, decoded."""
+    settings = dataclasses.replace(config.latent, from_last=False)
+    target = stages[0][3:]
+    signal = schedules.alphas_cumprod(settings.schedule, settings.train_timesteps)
+
+    def knows(z, timestep, action):
+        a = signal[timestep].reshape(-1, 1, 1, 1)
+        return (z[:, 3] - jnp.sqrt(a) * target) / jnp.sqrt(1 - a)
+
+    expected = jax.jit(lambda z: latent.decode(settings, tiny_data.atlas, latent_dynamics, z))(target)
+    bind = latent.bind
+    monkeypatch.setattr(latent, "bind", lambda cls, c, p: knows if cls is latent.Denoiser else bind(cls, c, p))
+    got = jax.jit(
+        lambda context: latent.sample(
+            settings, tiny_data.atlas, latent_dynamics, jax.random.key(0), context, jnp.array([1])
+        )
+    )(groups[:1, :3])
+    np.testing.assert_allclose(got, expected, atol=1e-4)
+
+
+def test_the_autoencoders_loss_is_its_foreground_error(config, tiny_data, latent_dynamics, groups):
+    """Whatever is decoded outside the mask costs nothing, and the error is told in normalised units."""
+    value, metrics = jax.jit(lambda k: latent.vae_loss(config.latent, tiny_data.atlas, latent_dynamics, k, groups[0]))(
+        jax.random.key(0)
+    )
+    scale = float(latent_dynamics.map_scale)
+    expected = float(metrics["rmse"]) ** 2 / scale**2 + config.latent.kl_weight * float(metrics["kl"])
+    assert float(value) == pytest.approx(expected, rel=1e-4)
+    assert posmap.root(tiny_data.atlas, groups[0, 2]) == pytest.approx(0.5, abs=1e-4)
