@@ -7,7 +7,7 @@ import pytest
 from flax import nnx
 
 from avatarjax.nets import functional
-from avatarjax.nets.point_transformer import Block, PointTransformer, PointTransformerConfig
+from avatarjax.nets.point_transformer import Block, CurveConvolution, PointTransformer, PointTransformerConfig
 from tests.parameters import random_module, random_params
 
 CONFIG = PointTransformerConfig(
@@ -69,6 +69,14 @@ def test_gradients_are_finite_and_reach_every_parameter(params, cloud):
         assert np.any(leaf != 0), path
 
 
+def test_curve_convolution_equals_numpys_in_every_channel():
+    module = random_module(lambda: CurveConvolution(3, rngs=nnx.Rngs(0)))
+    x = np.random.default_rng(0).normal(size=(9, 3))
+    kernel, bias = np.asarray(module.kernel[...]), np.asarray(module.bias[...])
+    expected = [np.convolve(x[:, c], kernel[::-1, c], mode="same") + bias[c] for c in range(3)]
+    np.testing.assert_allclose(module(jnp.asarray(x, jnp.float32)), np.stack(expected, -1), atol=1e-5)
+
+
 @pytest.mark.parametrize("count", [3, 11])
 def test_attention_stays_inside_patches_and_the_last_one_is_moved_back(count):
     """Against a loop: patches of 4 along the order, the last one over the last points, whose values it gives."""
@@ -82,7 +90,7 @@ def test_attention_stays_inside_patches_and_the_last_one_is_moved_back(count):
         patches = -(-count // 4)
         size = -(-count // patches)
         y = x[order]
-        y = y + block.position(y[None])[0]
+        y = y + block.position(y)
         tokens, attended = block.norm1(y), jnp.zeros_like(y)
         for k in range(patches):
             start = min(k * size, count - size)

@@ -349,15 +349,16 @@ def train_appearance(
         }
 
     def loss(params, key, batch):
-        def one(pose):
-            texels, views, rgba, white = pose
+        def dressed(texels):
             points, side = boxed_points(batch["upscaler"], texels)
             coarse = appearance.coarse_gaussians(batch["base"], points, side)
-            refined = appearance.refine(config.appearance, params, coarse)
-            return photometric_loss(config, refined, views, rgba, white, splat)
+            return appearance.refine(config.appearance, params, coarse)
 
-        poses = (batch["texels"], batch["views"], batch["rgba"], batch["white"])
-        value, metrics = jax.lax.map(one, poses)
+        # The network runs outside the loop over poses: inside one, XLA's CPU backend uses a single core.
+        clouds = jax.vmap(dressed)(batch["texels"])
+        value, metrics = jax.lax.map(
+            lambda pose: photometric_loss(config, *pose, splat), (clouds, batch["views"], batch["rgba"], batch["white"])
+        )
         return jnp.mean(value), jax.tree.map(jnp.mean, metrics)
 
     initial = functional.init(appearance.AppearanceNetwork, config.appearance, run.key("appearance"))
