@@ -62,8 +62,15 @@ def test_held_out_motion_is_the_same_transitions_in_another_way(tiny_data):
     assert (closest > 1e-4).all()  # other phases of the gait; metres
 
 
+def near_opaque(alpha):
+    """Pixels that are not transparent, or have such a neighbour."""
+    padded = np.pad(alpha > 0, 1)
+    height, width = alpha.shape
+    return np.any([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], axis=0)
+
+
 def test_pictures_show_the_texels_of_their_pose(tiny_data):
-    """A texel's place in the picture is opaque nearly always: texels lie on the surface (0.95: pixels are coarse)."""
+    """A texel's place in the picture is opaque, or beside an opaque pixel: texels lie on the surface."""
     upscaler = posmap.build_upscaler(tiny_data.atlas, 64)
     for images in (tiny_data.standing_images, tiny_data.train_images, tiny_data.held_out_images):
         cameras = dataset.cylinder_cameras(32)
@@ -77,7 +84,7 @@ def test_pictures_show_the_texels_of_their_pose(tiny_data):
                     cameras.intrinsics[view]
                 ).T
                 column, row = np.floor(seen[:, :2] / seen[:, 2:]).astype(int).T
-                assert (images.rgba[pose, slot, row, column, 3] > 0).mean() > 0.95
+                assert near_opaque(images.rgba[pose, slot, ..., 3])[row, column].mean() > 0.98
 
 
 def test_transparent_pixels_are_outside_and_the_figure_is_coloured(tiny_data):

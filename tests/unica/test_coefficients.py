@@ -105,7 +105,9 @@ def test_pushing_drops_the_oldest_frame(contexts):
 
 def test_noise_keeps_the_newest_root_and_clean_contexts(config, coefficient_dynamics, contexts, key):
     many = jax.tree.map(lambda x: jnp.tile(x, (60, *[1] * (x.ndim - 1))), contexts)
-    noised, level = co.noised_context(config.coefficients, coefficient_dynamics.scaling, key, many)
+    noised, level = jax.jit(co.noised_context, static_argnums=0)(
+        config.coefficients, coefficient_dynamics.scaling, key, many
+    )
     np.testing.assert_array_equal(noised.root[:, 2], many.root[:, 2])
     clean = np.asarray(level == 0).all(1)
     assert clean.mean() == pytest.approx(config.coefficients.clean_contexts, abs=0.08)

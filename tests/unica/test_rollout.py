@@ -1,7 +1,5 @@
 """The contract of an avatar that answers keys: pure, and the same by steps, by scan, in batches and when jitted."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +10,7 @@ from avatarjax.posmap import pca
 from avatarjax.unica.latent import LatentDynamics
 
 ACTIONS = np.array([1, 1, 3, 0], np.int32)
-roll = jax.jit(unica.rollout, static_argnames="gaussians")
-geometry = functools.partial(roll, gaussians=False)
+roll = jax.jit(unica.rollout)
 one_step = jax.jit(unica.step)
 
 
@@ -75,24 +72,20 @@ def test_it_is_deterministic(avatar, start, rolled):
     assert_same(roll(avatar, start, ACTIONS), rolled)
 
 
-def test_states_of_one_avatar_can_be_batched(avatar, start, rolled):
+def test_states_of_one_avatar_can_be_batched_without_gaussians(avatar, start, rolled):
+    """Each of the batch as if alone, and the geometry as with Gaussians."""
     states = jax.vmap(lambda k: unica.reset(avatar, k))(jax.random.split(jax.random.key(9), 2))
     states = states.replace(key=jnp.stack([start.key, states.key[1]]))
-    batched = jax.jit(jax.vmap(lambda s: unica.rollout(avatar, s, jnp.asarray(ACTIONS), gaussians=False)[1]))(states)
-    np.testing.assert_allclose(batched.root[0], rolled[1].root, atol=1e-4)
-    np.testing.assert_allclose(batched.posmap[0], rolled[1].posmap, atol=1e-4)
-    assert np.abs(batched.posmap[1] - batched.posmap[0]).max() > 1e-5
-
-
-def test_without_gaussians_the_geometry_is_the_same(avatar, start, rolled):
-    state, frames = geometry(avatar, start, ACTIONS)
+    roll_geometry = jax.vmap(lambda s: unica.rollout(avatar, s, jnp.asarray(ACTIONS), gaussians=False))
+    last, frames = jax.jit(roll_geometry)(states)
     assert frames.gaussians is None
-    assert_same(frames.replace(gaussians=None), rolled[1].replace(gaussians=None), 1e-5)
-    assert_same(state, rolled[0], 1e-5)
+    assert_same(jax.tree.map(lambda x: x[0], frames), rolled[1].replace(gaussians=None), 2e-4)
+    assert_same(jax.tree.map(lambda x: x[0], last), rolled[0], 2e-4)
+    assert np.abs(frames.posmap[1] - frames.posmap[0]).max() > 1e-5
 
 
 def test_the_action_matters(avatar, start, rolled):
-    other = geometry(avatar, start, np.array([2, 1, 3, 0], np.int32))[1]
+    other = roll(avatar, start, np.array([2, 1, 3, 0], np.int32))[1]
     assert np.abs(other.posmap[0] - rolled[1].posmap[0]).max() > 1e-5
 
 
@@ -126,7 +119,7 @@ def test_context_frames_keep_their_distances(avatar, rolled):
 
 def test_a_start_elsewhere_only_moves_the_ground(avatar, start, rolled):
     shift = jnp.asarray([100.0, 0.0, -50.0])
-    moved = geometry(avatar, start.replace(offset=start.offset + shift), ACTIONS)[1]
+    moved = roll(avatar, start.replace(offset=start.offset + shift), ACTIONS)[1]
     np.testing.assert_allclose(moved.root - shift[None], rolled[1].root, atol=1e-3)
     np.testing.assert_allclose(moved.posmap, rolled[1].posmap, atol=1e-5)
 
