@@ -45,7 +45,7 @@ def write(
     yaw, moves = _asked(data)
 
     paths = {name: _path(one, script, experiment.args.seed) for name, one in built.items()}
-    paths[driver] = np.asarray(frames.root)
+    paths[driver] = _before_each_action(avatar, np.asarray(frames.root))
     truth = np.asarray(data.truth.roots)
     answers = {name: responsiveness.responses(p, np.asarray(script), yaw, moves) for name, p in paths.items()}
     answers["controller"] = responsiveness.responses(truth, np.asarray(script), yaw, moves)
@@ -70,7 +70,9 @@ def write(
     nearest = _nearest(avatar, data, frames)
     measured["drift_mm"] = {n: _summary(x) for n, x in nearest.items()}
     ground = np.asarray(frames.info.ground)
-    measured["ground_mm"] = {int(k): round(1000 * float(ground[k]), 2) for k in np.linspace(0, len(ground) - 1, 5)}
+    measured["ground_mm"] = {
+        int(k): round(1000 * float(ground[k]), 2) for k in np.linspace(0, len(ground) - 1, 5).astype(int)
+    }
     measured["seconds"] = experiment.seconds
     atomic.write_text(folder / "metrics.json", json.dumps(measured, indent=2))
 
@@ -228,7 +230,13 @@ def _asked(data: Dataset) -> tuple[np.ndarray, np.ndarray]:
 def _path(avatar: unica.Avatar, script: tuple[int, ...], seed: int) -> np.ndarray:
     roll = jax.jit(unica.rollout, static_argnames="gaussians")
     state = unica.reset(avatar, jax.random.fold_in(jax.random.key(seed), 7))
-    return np.asarray(roll(avatar, state, jnp.asarray(script), gaussians=False)[1].root)
+    return _before_each_action(avatar, np.asarray(roll(avatar, state, jnp.asarray(script), gaussians=False)[1].root))
+
+
+def _before_each_action(avatar: unica.Avatar, roots: np.ndarray) -> np.ndarray:
+    """Roots (f, 3) at the frames where each action sets in, as recordings have them, from those after each action."""
+    start = unica.reset(avatar, jax.random.key(0)).offset
+    return np.concatenate([np.asarray(start)[None], roots[:-1]])
 
 
 def _nearest(avatar: unica.Avatar, data: Dataset, frames: unica.Frame) -> dict[str, np.ndarray]:

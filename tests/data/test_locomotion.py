@@ -7,6 +7,7 @@ import pytest
 
 from avatarjax.data import body as bodies
 from avatarjax.data import clips, locomotion, skinning
+from avatarjax.metrics import responsiveness
 
 DIRECTIONS = {1: (0, 1), 2: (0, -1), 3: (1, 0), 4: (-1, 0)}
 BEFORE, AFTER = 40, 50
@@ -38,7 +39,8 @@ def test_a_key_moves_the_root_in_its_direction(transitions, action):
 @pytest.mark.parametrize("pair", [(1, 2), (2, 1), (3, 4), (4, 3), (1, 3), (1, 4), (2, 3), (3, 1), (4, 2)])
 def test_turns_take_twelve_frames_for_a_half_and_nine_for_a_quarter(transitions, pair):
     wanted = locomotion.LocomotionConfig().directions[pair[1] - 1]
-    frames = locomotion.turn_frames(locomotion.movement_directions(transitions[pair]), BEFORE, wanted)
+    directions = responsiveness.movement_directions(np.asarray(transitions[pair].roots))
+    frames = responsiveness.turn_frames(directions, BEFORE, wanted)
     half = sorted(pair) in ([1, 2], [3, 4])
     assert abs(frames - (12 if half else 9)) <= 1
 

@@ -91,7 +91,7 @@ def _rounded(count: int) -> int:
 
 def _pose_once(avatar: AvatarMesh, quats: np.ndarray) -> np.ndarray:
     hips = avatar.rig.heads[avatar.rig.index("Hips")]
-    transforms = skinning.forward_kinematics(avatar.rig, jnp.asarray(quats), jnp.asarray(hips))[None]
+    transforms = jax.jit(skinning.forward_kinematics)(avatar.rig, jnp.asarray(quats), jnp.asarray(hips))[None]
     vertices = pose_vertices(avatar, transforms, transforms)[0]
     return vertices - np.array([0, vertices[:, 1].min(), 0], np.float32)
 
@@ -118,6 +118,6 @@ def standing_pose(avatar: AvatarMesh) -> Float[np.ndarray, "v 3"]:
     from avatarjax.data import clips
 
     idle = clips.load_clip("idle", avatar.rig)
-    transforms = jax.vmap(skinning.forward_kinematics, in_axes=(None, 0, 0))(avatar.rig, idle.quats[:1], idle.hips[:1])
+    transforms = jax.jit(skinning.forward_kinematics)(avatar.rig, idle.quats[0], idle.hips[0])[None]
     vertices = pose_vertices(avatar, transforms, transforms)[0]
     return vertices - np.array([0, vertices[:, 1].min(), 0], np.float32)

@@ -244,26 +244,6 @@ def _ground(rig: Rig, transforms: Array, effort: Array) -> Array:
     return -jnp.minimum(lowest, 0) - jnp.maximum(lowest, 0) * standing
 
 
-def movement_directions(motion: Motion) -> Float[Array, " g"]:
-    """Yaw (f - 1,) of the step from each frame to the next of the root on the ground, radians."""
-    steps = jnp.diff(motion.roots, axis=0)
-    return jnp.arctan2(steps[:, 0], steps[:, 2])
-
-
-def turn_frames(
-    directions: Float[Array, " g"], change: int, wanted: float, *, tolerance: float = 12.0, hold: int = 8
-) -> int:
-    """Frames from a key change at frame `change` until the movement direction stays within `tolerance` degrees of
-    `wanted` (yaw, radians) for `hold` frames; -1 where it never does. The definition under every number of turn frames
-    here."""
-    error = np.asarray(directions) - wanted
-    near = np.abs((error + np.pi) % (2 * np.pi) - np.pi) < np.deg2rad(tolerance)
-    for frame in range(change, len(near) - hold + 1):
-        if near[frame : frame + hold].all():
-            return frame - change
-    return -1
-
-
 def clip_motion(rig: Rig, clip: Clip, config: LocomotionConfig = LocomotionConfig()) -> Motion:
     """A clip played as it is, standing on the spot at the origin."""
     transforms = jax.vmap(skinning.forward_kinematics, in_axes=(None, 0, 0))(rig, clip.quats, clip.hips)

@@ -62,7 +62,7 @@ class AppearanceNetwork(nnx.Module):
         self.heads = nnx.Dict({name: self._head(width, size, config, rngs) for name, size in ATTRIBUTES.items()})
 
     @staticmethod
-    def _head(width: int, outputs: int, config: AppearanceConfig, rngs: nnx.Rngs) -> nnx.Sequential:
+    def _head(width: int, outputs: int, config: AppearanceConfig, rngs: nnx.Rngs) -> nnx.Module:
         layers = []
         for _ in range(config.head_layers - 1):
             layers += [nnx.Linear(width, config.head_width, rngs=rngs), jax.nn.gelu]

@@ -54,16 +54,17 @@ def _train(
     run: Run,
     name: str,
     stage: StageConfig,
-    config: typing.Any,
+    settings: typing.Any,
     loss: Loss,
     initial: Params,
     batch_at: Callable[[int], typing.Any],
     hold: Callable[[Params, Params, typing.Any], Params] | None = None,
 ) -> Params:
+    """Train one stage; `settings` is all of the configuration that its result depends on, beside the stage's own."""
     transform = optimiser(stage.learning_rate, stage.steps)
     state: TrainState = new_state(initial, transform, run.key(name), averaged=stage.ema > 0)
     step = make_step(loss, transform, decay=stage.ema, hold=hold)
-    mark = hashlib.sha256(f"{run.data} {run.seed} {stage} {config}".encode()).hexdigest()[:12]
+    mark = hashlib.sha256(f"{run.data} {run.seed} {stage} {settings}".encode()).hexdigest()[:12]
     return weights(fit(step, state, batch_at, stage.steps, run.folder, name, fingerprint=mark))
 
 
@@ -125,6 +126,7 @@ def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynami
     scale = float(data.atlas.scale)
     stage = config.unet_stage
     everything = np.ones_like(windows.turning)
+    settings = (config.latent, config.vae_stage, config.unet_steady, config.turn_window, config.turn_fraction)
 
     def batch_at(step):
         rng = batches.generator(run.seed, step)
@@ -150,7 +152,7 @@ def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynami
         table = jnp.where(batch["learn_actions"], new["action_table"]["embedding"], old["action_table"]["embedding"])
         return {**new, "action_table": {"embedding": table}}
 
-    return start.replace(denoiser=_train(run, "unet", stage, config, loss, start.denoiser, batch_at, hold))
+    return start.replace(denoiser=_train(run, "unet", stage, settings, loss, start.denoiser, batch_at, hold))
 
 
 def coefficient_frames(data: Dataset, recording: typing.Any) -> tuple[np.ndarray, np.ndarray]:
@@ -321,7 +323,7 @@ def train_base(config: UnicaConfig, data: Dataset, run: Run, upscaler: posmap.Up
         return photometric_loss(config, cloud, batch["views"], batch["rgba"], batch["white"], splat)
 
     initial = {name: getattr(start, name) for name in ("log_scales", "quats", "logit_opacities", "colors")}
-    trained = _train(run, "base", stage, config.appearance, loss, initial, batch_at)
+    trained = _train(run, "base", stage, (config.loss_l1, config.loss_ssim), loss, initial, batch_at)
     return start.replace(**trained)
 
 
@@ -362,7 +364,8 @@ def train_appearance(
         return jnp.mean(value), jax.tree.map(jnp.mean, metrics)
 
     initial = functional.init(appearance.AppearanceNetwork, config.appearance, run.key("appearance"))
-    return _train(run, "appearance", stage, config.appearance, loss, initial, batch_at)
+    settings = (config.appearance, config.base_stage, config.views_per_step, config.loss_l1, config.loss_ssim)
+    return _train(run, "appearance", stage, settings, loss, initial, batch_at)
 
 
 def image_psnr(
