@@ -53,7 +53,7 @@ class Args:
     resume: bool = True
     """Go on from checkpoints. --no-resume deletes this run's results first."""
     seed: int = 0
-    """Seed of data, training and rollout."""
+    """Seed of data, training and rollout; results of seeds other than 0 go to a folder PRESET-seedN."""
     out: Path = Path("runs")
     """Folder under which results go, as OUT/unica/AVATAR/PRESET/."""
 
@@ -160,7 +160,9 @@ def prepare(args: Args) -> Experiment:
     config = unica.preset(args.preset)
     if args.dynamics:
         config = dataclasses.replace(config, dynamics=args.dynamics)
-    experiment = Experiment(args, config, args.out / "unica" / args.avatar / args.preset)
+    # Another seed is another run: it must not replace the results of the first.
+    name = args.preset if args.seed == 0 else f"{args.preset}-seed{args.seed}"
+    experiment = Experiment(args, config, args.out / "unica" / args.avatar / name)
     if args.stage not in ("all", *experiment.stages()):
         raise ValueError(f"unknown stage {args.stage!r} here: choose one of all, {', '.join(experiment.stages())}")
     if not args.resume and experiment.folder.exists():
@@ -245,7 +247,7 @@ def roll_and_draw(experiment: Experiment, avatar: unica.Avatar) -> unica.Frame:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; errors a user can mend are printed, not traced."""
-    args = tyro.cli(Args, args=argv, description=__doc__)
+    args = tyro.cli(Args, prog="python -m experiments.unica", args=argv, description=__doc__)
     jax.config.update("jax_compilation_cache_dir", str(args.out.absolute() / ".jax_cache"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
     try:

@@ -49,6 +49,11 @@ def test_a_run_has_its_folder_and_config(tmp_path):
     assert (made.folder / "config.json").is_file()
 
 
+def test_another_seed_has_its_own_folder(tmp_path):
+    folders = [experiment.prepare(experiment.Args(preset="ci", seed=seed, out=tmp_path)).folder for seed in (0, 1)]
+    assert [f.name for f in folders] == ["ci", "ci-seed1"]
+
+
 def test_starting_over_deletes_only_this_run(tmp_path, capsys):
     folder = tmp_path / "unica" / "cowgirl"
     for preset in ("ci", "small"):
