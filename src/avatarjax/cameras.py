@@ -82,7 +82,7 @@ def orbit(
     return Camera(jnp.stack([c.world_to_camera for c in each]), jnp.stack([c.intrinsics for c in each]), width, height)
 
 
-def project(camera: Camera, points: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, n]]:
+def project(camera: Camera, points: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
     """Pixel coordinates (n, 2) and depth along the optical axis (n,) in metres of world points (n, 3)."""
     p = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[None, :3, 3]
     uvw = p @ camera.intrinsics.T

@@ -47,7 +47,7 @@ def transform(
     gaussians: Gaussians,
     scale: Float[Array, ""] | float,
     rotation: Float[Array, "3 3"],
-    translation: Float[Array, 3],
+    translation: Float[Array, " 3"],
 ) -> Gaussians:
     """The cloud under x -> scale * rotation @ x + translation: means, orientations and sizes move together.
 

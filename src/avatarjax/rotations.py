@@ -102,8 +102,8 @@ def yaw_matrix(yaw: Float[Array, "*b"]) -> Float[Array, "*b 3 3"]:
 
 
 def similarity_fit(
-    source: Float[Array, "n 3"], target: Float[Array, "n 3"], weights: Float[Array, n] | None = None
-) -> tuple[Float[Array, ""], Float[Array, "3 3"], Float[Array, 3]]:
+    source: Float[Array, "n 3"], target: Float[Array, "n 3"], weights: Float[Array, " n"] | None = None
+) -> tuple[Float[Array, ""], Float[Array, "3 3"], Float[Array, " 3"]]:
     """Least-squares scale, rotation and translation with target ~ scale * R @ source + t (Procrustes analysis).
 
     Reflections are excluded (Umeyama 1991, "Least-squares estimation of transformation parameters between two point

@@ -75,7 +75,7 @@ def load_clips(rig: body.Rig) -> Clips:
     return Clips(idle, run, jnp.float32(np.median(backwards[stance])))
 
 
-def sample(clip: Clip, phase: Float[Array, ""]) -> tuple[Float[Array, "j 4"], Float[Array, 3]]:
+def sample(clip: Clip, phase: Float[Array, ""]) -> tuple[Float[Array, "j 4"], Float[Array, " 3"]]:
     """Pose of a looping clip at a phase in cycles (any real number): local rotations (j, 4) and hips (3,)."""
     count = clip.quats.shape[0]
     position = (phase % 1.0) * count

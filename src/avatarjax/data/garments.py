@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import typing
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,7 +10,7 @@ from jaxtyping import Float, Int
 from avatarjax.data.body import Rig
 
 # A number, or one for each element.
-_Edge = np.ndarray | typing.SupportsFloat
+_Edge = np.ndarray | float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

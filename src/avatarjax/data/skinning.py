@@ -18,7 +18,7 @@ def _generations(parents: tuple[int, ...]) -> list[np.ndarray]:
     return [np.flatnonzero(np.array(depth) == d) for d in range(max(depth) + 1)]
 
 
-def forward_kinematics(rig: Rig, local_quats: Float[Array, "j 4"], hips: Float[Array, 3]) -> Float[Array, "j 3 4"]:
+def forward_kinematics(rig: Rig, local_quats: Float[Array, "j 4"], hips: Float[Array, " 3"]) -> Float[Array, "j 3 4"]:
     """Transforms (j, 3, 4) that carry points from the rest pose to the posed world, one a bone.
 
     `local_quats` (j, 4) turn each bone against its parent, the identity being the rest pose; `hips` (3,) is the world

@@ -92,7 +92,7 @@ def required_capacity(
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _render(gaussians: Gaussians, camera: Camera, background: Float[Array, 3], config: SplatConfig) -> RenderOutput:
+def _render(gaussians: Gaussians, camera: Camera, background: Float[Array, " 3"], config: SplatConfig) -> RenderOutput:
     if len(gaussians) == 0:
         return _nothing(camera, background)
     grid = _grid(camera, config)
@@ -125,7 +125,7 @@ def _grid(camera: Camera, config: SplatConfig) -> tiles.TileGrid:
     return tiles.TileGrid(camera.width, camera.height, config.tile_width, config.tile_height)
 
 
-def _nothing(camera: Camera, background: Float[Array, 3]) -> RenderOutput:
+def _nothing(camera: Camera, background: Float[Array, " 3"]) -> RenderOutput:
     size = (camera.height, camera.width)
     none = jnp.int32(0)
     info = RenderInfo(none, none, none, capacity=0)
