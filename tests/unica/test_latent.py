@@ -77,6 +77,28 @@ class TestLoss:
         loss = self.loss(monkeypatch, settings, tiny_data, latent_dynamics, groups, knows)
         assert float(loss) == pytest.approx(0, abs=1e-4)
 
+    def test_the_change_from_frame_t_is_all_that_from_last_asks_for(
+        self, monkeypatch, settings, tiny_data, latent_dynamics, groups
+    ):
+        target = encode(settings, tiny_data.atlas, latent_dynamics, groups[:, 3])
+        settings = dataclasses.replace(settings, from_last=True)
+        loss = self.loss(
+            monkeypatch, settings, tiny_data, latent_dynamics, groups, lambda z, t, a: target - z[:, latent.CONTEXT - 1]
+        )
+        assert float(loss) == pytest.approx(0, abs=1e-4)
+
+    def test_min_snr_only_lowers_the_weight_of_little_noise(
+        self, monkeypatch, settings, tiny_data, latent_dynamics, groups
+    ):
+        def loss(cap):
+            changed = dataclasses.replace(settings, min_snr=cap)
+            nothing = lambda z, t, a: jnp.zeros_like(z[:, 3])  # noqa: E731
+            return float(self.loss(monkeypatch, changed, tiny_data, latent_dynamics, groups, nothing))
+
+        plain = loss(0.0)
+        assert loss(1e6) == pytest.approx(plain, rel=1e-5)
+        assert loss(1e-3) < 0.9 * plain
+
     def test_no_answer_costs_the_variance_of_the_noise(self, monkeypatch, settings, tiny_data, latent_dynamics, groups):
         loss = self.loss(
             monkeypatch, settings, tiny_data, latent_dynamics, groups, lambda z, t, a: jnp.zeros_like(z[:, 3])

@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 
 import jax
@@ -32,6 +33,30 @@ def test_maps_of_a_batch_do_not_mix(params, key):
     changed = x.at[1].set(0.0)
     np.testing.assert_allclose(encode(changed)[0], encode(x)[0], atol=1e-5)
     assert np.abs(encode(changed)[1] - encode(x)[1]).max() > 1e-3
+
+
+def test_learned_places_change_nothing_until_they_are_learned(params, key):
+    config = dataclasses.replace(CONFIG, positions=8)
+    neutral = {
+        name: {"gain": jnp.ones((side, side, c)), "shift": jnp.zeros((side, side, c))}
+        for name, side, c in (
+            ("encoder_fine", 8, 8),
+            ("encoder_coarse", 2, 16),
+            ("decoder_coarse", 2, 16),
+            ("decoder_fine", 8, 8),
+        )
+    }
+    x = jax.random.normal(key, (1, 8, 8, 3))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def around(config, params):
+        network = bind(VAE, config, params)
+        return network.decode(network.encode(x)[0])
+
+    np.testing.assert_allclose(around(config, {**params, "places": neutral}), around(CONFIG, params), atol=1e-5)
+    shift = jnp.zeros((8, 8, 8)).at[0, 0].set(1.0)
+    moved = {**neutral, "decoder_fine": {**neutral["decoder_fine"], "shift": shift}}
+    assert np.abs(around(config, {**params, "places": moved}) - around(CONFIG, params)).max() > 1e-3
 
 
 def test_the_papers_autoencoder_downsamples_by_eight():

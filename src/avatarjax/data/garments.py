@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from avatarjax.data.body import Rig
 
 # A number, or one for each element.
-_Edge = np.ndarray | float
+_Edge = np.ndarray | np.floating | float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
