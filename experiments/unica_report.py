@@ -19,7 +19,7 @@ from avatarjax.data.sequences import ACTIONS
 from avatarjax.io import atomic
 from avatarjax.metrics import drift, responsiveness
 from avatarjax.metrics.report import Report
-from avatarjax.unica import batches, evaluate, train
+from avatarjax.unica import batches, evaluate
 from experiments import pictures
 
 if typing.TYPE_CHECKING:
@@ -55,11 +55,11 @@ def write(
         "responses": answers,
         "components_mm": evaluate.components(avatar, data, chosen),
         "psnr": {
-            label: _summary(train.image_psnr(experiment.config, images, avatar.upscaler, avatar.base, params))
-            for label, images, params in (
-                ("base attributes, standing pose", data.standing_images, None),
-                ("base attributes, held-out poses", data.held_out_images, None),
-                ("with appearance network, held-out poses", data.held_out_images, avatar.appearance),
+            label: _summary(evaluate.image_psnr(avatar, images, refined=refined))
+            for label, images, refined in (
+                ("base attributes, standing pose", data.standing_images, False),
+                ("base attributes, held-out poses", data.held_out_images, False),
+                ("with appearance network, held-out poses", data.held_out_images, True),
             )
         },
     }

@@ -20,7 +20,7 @@ import numpy as np
 
 from avatarjax import posmap
 from avatarjax.cameras import Camera
-from avatarjax.data.dataset import Dataset, Images, cylinder_cameras
+from avatarjax.data.dataset import Dataset, cylinder_cameras
 from avatarjax.nets import functional
 from avatarjax.nets.functional import Params
 from avatarjax.posmap import pca as pcs
@@ -289,11 +289,12 @@ def photometric_loss(
     return loss, {"psnr": psnr, "dropped": jnp.sum(dropped).astype(jnp.float32)}
 
 
-def _pick(cameras: Camera, views: np.ndarray) -> Camera:
+def pick_views(cameras: Camera, views: np.ndarray) -> Camera:
+    """The cameras of these ids from a batch of cameras."""
     return jax.tree.map(lambda x: x[views], cameras)
 
 
-def _splat_config(gaussians: typing.Any, cameras: Camera) -> SplatConfig:
+def splat_config(gaussians: typing.Any, cameras: Camera) -> SplatConfig:
     """Room for three times what the cloud needs before training: its Gaussians will grow."""
     return SplatConfig(capacity=min(2**24, 3 * required_capacity(gaussians, cameras)))
 
@@ -304,7 +305,7 @@ def train_base(config: UnicaConfig, data: Dataset, run: Run, upscaler: posmap.Up
     cameras = cylinder_cameras(images.rgba.shape[-2])
     points, side = boxed_points(upscaler, jnp.asarray(images.texels[0]))
     start = appearance.initial_base(points, side)
-    splat = _splat_config(appearance.coarse_gaussians(start, points, side), cameras)
+    splat = splat_config(appearance.coarse_gaussians(start, points, side), cameras)
 
     def batch_at(step):
         rng = batches.generator(run.seed, step)
@@ -312,7 +313,7 @@ def train_base(config: UnicaConfig, data: Dataset, run: Run, upscaler: posmap.Up
         return {
             "points": points,
             "height": side,
-            "views": _pick(cameras, images.view[0, slots]),
+            "views": pick_views(cameras, images.view[0, slots]),
             "rgba": images.rgba[0, slots],
             "white": np.float32(rng.integers(2)),
         }
@@ -334,7 +335,7 @@ def train_appearance(
     stage, images = config.appearance_stage, data.train_images
     cameras = cylinder_cameras(images.rgba.shape[-2])
     points, side = boxed_points(upscaler, jnp.asarray(images.texels[0]))
-    splat = _splat_config(appearance.coarse_gaussians(base, points, side), cameras)
+    splat = splat_config(appearance.coarse_gaussians(base, points, side), cameras)
     k = min(config.views_per_step, images.view.shape[1])
 
     def batch_at(step):
@@ -345,7 +346,7 @@ def train_appearance(
             "upscaler": upscaler,
             "base": base,
             "texels": images.texels[poses],
-            "views": _pick(cameras, images.view[poses[:, None], slots]),
+            "views": pick_views(cameras, images.view[poses[:, None], slots]),
             "rgba": images.rgba[poses[:, None], slots],
             "white": rng.integers(0, 2, stage.batch).astype(np.float32),
         }
@@ -366,36 +367,3 @@ def train_appearance(
     initial = functional.init(appearance.AppearanceNetwork, config.appearance, run.key("appearance"))
     settings = (config.appearance, config.base_stage, config.views_per_step, config.loss_l1, config.loss_ssim)
     return _train(run, "appearance", stage, settings, loss, initial, batch_at)
-
-
-def image_psnr(
-    config: UnicaConfig,
-    images: Images,
-    upscaler: posmap.Upscaler,
-    base: appearance.BaseAttributes,
-    params: Params | None,
-) -> np.ndarray:
-    """PSNR (p, k) in dB of each picture over black, with the appearance network or, for None, with base attributes."""
-    cameras = cylinder_cameras(images.rgba.shape[-2])
-    points, side = boxed_points(upscaler, jnp.asarray(images.texels[0]))
-    splat = _splat_config(appearance.coarse_gaussians(base, points, side), cameras)
-
-    @jax.jit
-    def one(upscaler, base, params, texels, views, rgba):
-        points, side = boxed_points(upscaler, texels)
-        cloud = appearance.coarse_gaussians(base, points, side)
-        if params is not None:
-            cloud = appearance.refine(config.appearance, params, cloud)
-
-        def view(inputs):
-            camera, truth = inputs
-            return photometric_loss(config, cloud, jax.tree.map(lambda x: x[None], camera), truth[None], 0.0, splat)[1]
-
-        return jax.lax.map(view, (views, rgba))["psnr"]
-
-    return np.stack(
-        [
-            np.asarray(one(upscaler, base, params, images.texels[p], _pick(cameras, images.view[p]), images.rgba[p]))
-            for p in range(len(images.texels))
-        ]
-    )
