@@ -55,11 +55,12 @@ def write(
         "responses": answers,
         "components_mm": evaluate.components(avatar, data, chosen),
         "psnr": {
-            label: _summary(evaluate.image_psnr(avatar, images, refined=refined))
-            for label, images, refined in (
-                ("base attributes, standing pose", data.standing_images, False),
-                ("base attributes, held-out poses", data.held_out_images, False),
-                ("with appearance network, held-out poses", data.held_out_images, True),
+            label: _summary(evaluate.image_psnr(one, images, refined=refined))
+            for label, one, images, refined in (
+                ("untrained base, standing pose", evaluate.untrained_base(avatar, data), data.standing_images, False),
+                ("base attributes, standing pose", avatar, data.standing_images, False),
+                ("base attributes, held-out poses", avatar, data.held_out_images, False),
+                ("with appearance network, held-out poses", avatar, data.held_out_images, True),
             )
         },
     }
@@ -127,7 +128,7 @@ def _page(
         verdicts=verdicts,
     )
     page.media(folder / "components.png", "Alignment error against the number of components (as UNICA Fig. B).")
-    page.media(folder / "drift.png", "Drift: the rollout, and held-out recordings for comparison.")
+    page.media(folder / "drift.png", "Drift: the rollout, and for comparison the controller under the same keys.")
     page.text(f"Height of the lowest point by frame, mm (a trend is vertical drift): {measured['ground_mm']}.")
 
     page.heading("What is poor")
@@ -179,6 +180,13 @@ def _stage_rows(measured: dict[str, typing.Any]) -> tuple[list[tuple], list[bool
     )
     verdicts.append(counts[most] < counts[fewer])
     psnr = measured["psnr"]
+    add(
+        "base attribute map, standing pose, against untrained attributes",
+        psnr["base attributes, standing pose"],
+        psnr["untrained base, standing pose"],
+        higher=True,
+        unit=" dB",
+    )
     add(
         "appearance network, against the base attribute map",
         psnr["with appearance network, held-out poses"],

@@ -109,6 +109,12 @@ def components(avatar: Avatar, data: Dataset, chosen: Int[np.ndarray, "g"]) -> d
     return errors
 
 
+def untrained_base(avatar: Avatar, data: Dataset) -> Avatar:
+    """The avatar with the base attributes from which its base stage started: what that stage has to beat."""
+    points, side = training.boxed_points(avatar.upscaler, jnp.asarray(data.standing_images.texels[0]))
+    return avatar.replace(base=appearance.initial_base(points, side))
+
+
 def image_psnr(avatar: Avatar, images: Images, *, refined: bool) -> Float[np.ndarray, "p k"]:
     """PSNR in dB of each picture over black, with the appearance network or with base attributes alone."""
     cameras = cylinder_cameras(images.rgba.shape[-2])
