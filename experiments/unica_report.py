@@ -19,7 +19,7 @@ from avatarjax.data.sequences import ACTIONS
 from avatarjax.io import atomic
 from avatarjax.metrics import drift, responsiveness
 from avatarjax.metrics.report import Report
-from avatarjax.unica import batches, evaluate
+from avatarjax.unica import batches, evaluate, fit
 from experiments import pictures
 
 if typing.TYPE_CHECKING:
@@ -44,8 +44,8 @@ def write(
     key = jax.random.key(experiment.args.seed + 11)
     yaw, moves = _asked(data)
 
-    paths = {name: _path(one, script, experiment.args.seed) for name, one in built.items()}
-    paths[driver] = _before_each_action(avatar, np.asarray(frames.root))
+    paths = {driver: _before_each_action(avatar, np.asarray(frames.root))}
+    paths |= {name: _path(one, script, experiment.args.seed) for name, one in built.items() if name != driver}
     truth = np.asarray(data.truth.roots)
     answers = {name: responsiveness.responses(p, np.asarray(script), yaw, moves) for name, p in paths.items()}
     answers["controller"] = responsiveness.responses(truth, np.asarray(script), yaw, moves)
@@ -229,8 +229,6 @@ def _interval(s: dict[str, float], unit: str) -> str:
 
 def _asked(data: Dataset) -> tuple[np.ndarray, np.ndarray]:
     """World yaw and movement flag of every action, measured on the training data."""
-    from avatarjax.unica import fit
-
     ground = np.asarray(data.train.roots)[:, [0, 2, 1]]
     return fit.action_directions(ground, np.asarray(data.train.actions), np.asarray(data.train.sequence), len(ACTIONS))
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from avatarjax import rotations
 from avatarjax.data import skinning
 from avatarjax.data.body import Rig
-from avatarjax.data.clips import Clip, Clips, sample
+from avatarjax.data.clips import Clips, sample
 from avatarjax.physics import springs
 
 
@@ -242,12 +242,3 @@ def _ground(rig: Rig, transforms: Array, effort: Array) -> Array:
     lowest = jax.vmap(skinning.sole_points, in_axes=(None, 0))(rig, transforms)[..., 1].min(axis=(1, 2))
     standing = jnp.clip(1 - 2.5 * effort, 0, 1)
     return -jnp.minimum(lowest, 0) - jnp.maximum(lowest, 0) * standing
-
-
-def clip_motion(rig: Rig, clip: Clip, config: LocomotionConfig = LocomotionConfig()) -> Motion:
-    """A clip played as it is, standing on the spot at the origin."""
-    transforms = jax.vmap(skinning.forward_kinematics, in_axes=(None, 0, 0))(rig, clip.quats, clip.hips)
-    count = clip.quats.shape[0]
-    lagged = springs.follow(transforms, frequency=config.lag_frequency, damping=config.lag_damping, dt=1 / config.fps)
-    still = jnp.zeros(count)
-    return Motion(clip.quats, clip.hips, transforms, lagged, jnp.zeros((count, 3)), still, still)

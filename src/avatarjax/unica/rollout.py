@@ -147,9 +147,8 @@ def _step(avatar: Avatar, state: State, action: Int[Array, ""], gaussians: bool)
 
 def _advance_latent(avatar: Avatar, state: State, key, action):
     """The next normalised texels, and the context renormalised about them (Eq. 8)."""
-    texels = latent.sample(avatar.config.latent, avatar.atlas, avatar.dynamics, key, state.context[None], action[None])[
-        0
-    ]
+    settings, context = avatar.config.latent, state.context[None]
+    texels = latent.sample(settings, avatar.atlas, avatar.dynamics, key, context, action[None])[0]
     context = jnp.concatenate([state.context[1:], texels[None]])
     return context - (posmap.root(avatar.atlas, texels) - 0.5)[None, None], texels
 

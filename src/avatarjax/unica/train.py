@@ -20,6 +20,7 @@ import numpy as np
 
 from avatarjax import posmap
 from avatarjax.cameras import Camera
+from avatarjax.data import sequences
 from avatarjax.data.dataset import Dataset, cylinder_cameras
 from avatarjax.nets import functional
 from avatarjax.nets.functional import Params
@@ -183,10 +184,8 @@ def train_coefficients(config: UnicaConfig, data: Dataset, run: Run) -> Coeffici
     single = batches.windows(data.train, 4, config.turn_window)
     long = batches.windows(data.train, 3 + settings.rollout_frames, config.turn_window)
     # A long window is worth oversampling when the turn is in its middle.
-    middle = batches.windows(data.train, 4, config.turn_window).turning
-    turning_at = np.zeros(len(data.train.actions), bool)
-    turning_at[single.first + 3] = middle
-    long_turning = turning_at[long.first + 3 + settings.rollout_frames // 2]
+    near_turn = sequences.turning(data.train.actions, data.train.sequence, config.turn_window)
+    long_turning = near_turn[long.first + 3 + settings.rollout_frames // 2]
 
     everything = single.frames(np.arange(len(single.first)))
     linear = closed_form.ridge_start(
