@@ -246,7 +246,7 @@ def test_scalar_background_is_grey():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sh": jnp.zeros((5, 3, 3))}, "plain colours"),
+        ({"sh": jnp.zeros((5, 4, 3))}, "3, 8 or 15 coefficients"),
         ({"quats": jnp.zeros((5, 3))}, r"gaussians\.quats must have shape \(5, 4\)"),
         ({"means": jnp.zeros((2, 5, 3))}, r"use jax\.vmap"),
         ({"colors": jnp.zeros((5, 3), jnp.bfloat16)}, "must be float32"),

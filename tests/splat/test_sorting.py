@@ -33,8 +33,22 @@ def test_depth_order_of_the_invisible_is_a_permutation():
     np.testing.assert_array_equal(np.sort(order), np.arange(50))
 
 
-def test_values_are_grouped_by_key_in_stable_order():
+@pytest.mark.parametrize("n", [1, 2, 31, 32, 33, 1000])
+def test_layout_in_columns_and_back_is_the_identity(n):
+    layout = sorting.Columns.of(n, 32)
+    x = jnp.arange(n, dtype=jnp.int32)
+    laid = layout.lay(x, -1)
+    np.testing.assert_array_equal(layout.flat(laid), x)
+    np.testing.assert_array_equal(jnp.where(laid < 0, layout.elements, laid), layout.elements)
+
+
+@pytest.mark.parametrize(
+    "group", [sorting.group_by_key, sorting._group_counting, sorting._group_lax], ids=["here", "counting", "lax"]
+)
+def test_values_are_grouped_by_key_in_stable_order(group):
     keys = np.random.default_rng(0).integers(0, 8, 500).astype(np.int32)
-    values, starts, ends = sorting.group_by_key(jnp.asarray(keys), jnp.arange(500, dtype=jnp.int32), 7)
+    layout = sorting.Columns.of(500, 8)
+    laid = layout.lay(jnp.asarray(keys), 7)
+    values, starts, ends = group(laid, layout.elements, 7)
     for key in range(7):
         np.testing.assert_array_equal(values[starts[key] : ends[key]], np.flatnonzero(keys == key))

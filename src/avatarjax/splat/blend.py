@@ -1,335 +1,343 @@
 """Front-to-back alpha blending of per-tile lists, forward and backward, in plain lax operations.
 
-A fixed number of lanes works through a queue of tiles, longest list first. A lane blends a few entries of its tile's
-list per iteration; when the list is exhausted or the tile opaque, it writes the tile out and takes the next one. So all
-lanes have work until the queue is empty, though lists differ in length by a factor of a hundred.
-
-The backward pass keeps no lists of weights: it blends front to back again and gets the colour behind an entry as the
-final colour less the colour in front of it, with no division by the transmittance.
+Each lane (see lanes.py) blends a few list entries of its tile per iteration. The backward pass keeps no lists of
+weights: it blends front to back again and gets the colour behind an entry as the final colour less the colour in front
+of it, with no division by the transmittance.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 import typing
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from avatarjax.splat import columns
-from avatarjax.splat.config import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, SplatConfig
-from avatarjax.splat.project import Splats
-from avatarjax.splat.tiles import TileGrid, TileLists
-
-# Columns of the table of Gaussians; those from _CHANNELS on are blended.
-_X, _Y, _XX, _XY, _YY, _LOG_OPACITY, _CHANNELS = range(7)
-_MIN_LANES = 16
+from avatarjax.splat import lanes
+from avatarjax.splat.config import ALPHA_MAX, ALPHA_MIN, SplatConfig
+from avatarjax.splat.project import CHANNELS, LOG2_OPACITY, XX, XY, YY, X, Y
+from avatarjax.splat.tiles import TileLists
 
 
-def fields_of(splats: Splats, channels: list[Float[Array, " n"]]) -> list[Float[Array, " n"]]:
-    """What `blend` reads of n Gaussians; the conic with the factors of -(xx dx^2 + 2 xy dx dy + yy dy^2) / 2 in it."""
-    conic = [-0.5 * splats.conic_xx, -splats.conic_xy, -0.5 * splats.conic_yy]
-    return [splats.x, splats.y, *conic, splats.log_opacity, *channels]
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
 def blend(
-    fields: list[Float[Array, " n"]], lists: TileLists, grid: TileGrid, config: SplatConfig
+    table: Float[Array, "n k"], lists: TileLists, corners: Float[Array, "t 2"], config: SplatConfig
 ) -> Float[Array, "t c p"]:
-    """Blend the channels in `fields_of` over every tile; the last of the c results is the transmittance.
+    """Blend the channels of a `Splats.table` over every tile; the last of the c results is the transmittance.
 
-    Differentiable with respect to the fields. An entry counts from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is
-    finished once no pixel of it lets more than TRANSMITTANCE_MIN through. Under `jax.vmap` the scenes are blended one
-    after another.
+    `corners` are the upper left corners of the tiles, pixels. Differentiable with respect to the table. An entry counts
+    from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is finished once no pixel of it lets more than TRANSMITTANCE_MIN
+    through. Under `jax.vmap` the tiles of all scenes share the lanes.
     """
-    return _blend_table(_table(fields), lists, grid, config)
+    return _blend_fwd(table, lists, corners, config)[0]
 
 
-def _blend_table(
-    table: Float[Array, "n k"], lists: TileLists, grid: TileGrid, config: SplatConfig
-) -> Float[Array, "t c p"]:
-    lanes = _lanes(config.forward_lanes, grid)
-    forward = functools.partial(_forward, grid=grid, lanes=lanes, steps=config.forward_steps)
-    return jax.custom_batching.sequential_vmap(forward)(table, lists)
+def _blend_fwd(table, lists, corners, config):
+    # A last row that is transparent, for lanes past the end of their list.
+    blank = jnp.zeros((1, table.shape[1]), jnp.float32).at[0, LOG2_OPACITY].set(-1e9)
+    table = jnp.concatenate([table, blank])
+    blended = _forward(table, *lists[:3], corners, config=config)
+    return blended, (table, lists, corners, blended)
 
 
-def _blend_fwd(fields, lists, grid, config):
-    table = _table(fields)
-    blended = _blend_table(table, lists, grid, config)
-    return blended, (table, lists, blended)
-
-
-def _blend_bwd(grid, config, residuals, cotangent):
-    table, lists, blended = residuals
-    lanes = _lanes(config.backward_lanes, grid)
-    backward = functools.partial(_backward, grid=grid, lanes=lanes, steps=config.backward_steps)
-    gradient = jax.custom_batching.sequential_vmap(backward)(table, lists, blended, cotangent)
-    return columns.split(gradient[:-1]), None
+def _blend_bwd(config, residuals, cotangent):
+    table, lists, corners, blended = residuals
+    table, cotangent = _first_order(table), _first_order(cotangent)
+    return _backward(table, *lists[:3], corners, blended, cotangent, config=config)[:-1], None, None
 
 
 blend.defvjp(_blend_fwd, _blend_bwd)
 
 
-def _table(fields: list[Float[Array, " n"]]) -> Float[Array, "n+1 k"]:
-    """One row per Gaussian, which a lane reads at once, and a last row that is transparent."""
-    rest = [jnp.pad(f, (0, 1), constant_values=-1e9 if k == _LOG_OPACITY else 0.0) for k, f in enumerate(fields)]
-    return columns.join(rest)
+@jax.custom_jvp
+def _first_order(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """x, with a clear error where somebody differentiates what is made of it."""
+    return x
 
 
-def _lanes(most: int, grid: TileGrid) -> int:
-    """Fewer lanes for small images, or the last ones idle while the longest lists end."""
-    return min(most, max(_MIN_LANES, grid.tiles // 16))
+@_first_order.defjvp
+def _refuse(primals, tangents):
+    raise TypeError("render has first derivatives only: for second ones use avatarjax.splat.reference.render_reference")
 
 
-class _Queue(typing.NamedTuple):
-    """Tiles by falling list length, then the number of tiles, which stands for "none", for two rounds of lanes."""
+def _over_scenes(kernel):
+    """Let `kernel` draw several scenes under `jax.vmap` as one scene with all their tiles.
 
-    order: Int[Array, " q"]
-    starts: Int[Array, " t+1"]
-    ends: Int[Array, " t+1"]
+    Many small images keep more lanes busy than one, and share the cost of each iteration.
+    """
+
+    @functools.wraps(kernel)
+    def draw(*arguments, config):
+        run = jax.custom_batching.custom_vmap(functools.partial(kernel, config=config))
+
+        @run.def_vmap
+        def fold(scenes, batched, table, ids, starts, ends, *blocks):
+            given = (table, ids, starts, ends, *blocks)
+            given = [x if b else jnp.broadcast_to(x, (scenes, *x.shape)) for x, b in zip(given, batched, strict=True)]
+            table, ids, starts, ends, *blocks = given
+            scene = jnp.arange(scenes, dtype=jnp.int32)[:, None]
+            ids, starts, ends = ids + scene * table.shape[1], starts + scene * ids.shape[1], ends + scene * ids.shape[1]
+            folded = [x.reshape(-1, *x.shape[2:]) for x in (table, ids, starts, ends, *blocks)]
+            result = run(*folded)
+            return result.reshape(scenes, -1, *result.shape[1:]), True
+
+        return run(*arguments)
+
+    return draw
 
 
 class _Forward(typing.NamedTuple):
-    tile: Int[Array, " l"]
-    position: Int[Array, " l"]
+    work: lanes.Work
     transmittance: Float[Array, "l p"]
-    channels: list[Float[Array, "l p"]]
-    taken: Int[Array, ""]
+    channels: Float[Array, "l c p"]
     out: Float[Array, "t+l c p"]
+    out_transmittance: Float[Array, "t+l p"]
+    rows: Float[Array, "l+1 s k"]
+    alphas: Float[Array, "l+1 s p"]
+    mixed: Float[Array, "l+1 c p"]
+
+
+@_over_scenes
+def _forward(
+    table: Float[Array, "n k"],
+    ids: Int[Array, " m"],
+    starts: Int[Array, " t"],
+    ends: Int[Array, " t"],
+    corners: Float[Array, "t 2"],
+    *,
+    config: SplatConfig,
+) -> Float[Array, "t c p"]:
+    lists = lanes.Lists(ids, starts, ends)
+    n_tiles, n_channels = starts.shape[0], table.shape[1] - CHANNELS
+    n_lanes, steps = lanes.number(config.forward_lanes, n_tiles), config.forward_steps
+    pixels = jnp.asarray(_pixels(config), jnp.float32)
+    queue, work = lanes.start(lists, n_lanes)
+    corners = jnp.pad(corners, ((0, 1), (0, 0)))
+    # Lanes that are not done write behind the image: a scatter to distinct places is cheaper than a select.
+    spare = n_tiles + jnp.arange(n_lanes, dtype=jnp.int32)
+
+    def iterate(s: _Forward) -> _Forward:
+        chosen = lanes.entries(s.work, queue, lists, steps, table.shape[0] - 1)
+        rows = lanes.in_place(s.rows, table.at[chosen].get(mode="promise_in_bounds"), s.work)
+        alphas = lanes.in_place(s.alphas, _alphas(rows[:-1], pixels, corners[s.work.tile]), s.work)
+        # Horner's scheme over the entries, back to front: one product less per entry than summing up weights.
+        mixed = jnp.zeros_like(s.channels)
+        for k in reversed(range(steps)):
+            mixed = mixed + alphas[:-1, k, None] * (rows[:-1, k, CHANNELS:, None] - mixed)
+        mixed = lanes.in_place(s.mixed, mixed, s.work)
+        channels = s.channels + s.transmittance[:, None] * mixed[:-1]
+        transmittance = s.transmittance
+        for k in range(steps):
+            transmittance = transmittance * (1 - alphas[:-1, k])
+        done, work = lanes.advance(s.work, queue, steps, transmittance)
+        place = jnp.where(done, s.work.tile, spare)
+        write = {"unique_indices": True, "mode": "promise_in_bounds"}
+        return _Forward(
+            work=work,
+            transmittance=jnp.where(done[:, None], 1.0, transmittance),
+            channels=jnp.where(done[:, None, None], 0.0, channels),
+            out=s.out.at[place].set(channels, **write),
+            out_transmittance=s.out_transmittance.at[place].set(transmittance, **write),
+            rows=rows,
+            alphas=alphas,
+            mixed=mixed,
+        )
+
+    n_pixels = pixels.shape[0]
+    first = _Forward(
+        work=work,
+        transmittance=jnp.ones((n_lanes, n_pixels), jnp.float32),
+        channels=jnp.zeros((n_lanes, n_channels, n_pixels), jnp.float32),
+        out=jnp.zeros((n_tiles + n_lanes, n_channels, n_pixels), jnp.float32),
+        out_transmittance=jnp.ones((n_tiles + n_lanes, n_pixels), jnp.float32),
+        rows=jnp.zeros((n_lanes + 1, steps, table.shape[1]), jnp.float32),
+        alphas=jnp.zeros((n_lanes + 1, steps, n_pixels), jnp.float32),
+        mixed=jnp.zeros((n_lanes + 1, n_channels, n_pixels), jnp.float32),
+    )
+    last = lax.while_loop(lambda s: lanes.busy(s.work, queue), iterate, first)
+    return jnp.concatenate([last.out[:n_tiles], last.out_transmittance[:n_tiles, None]], axis=1)
 
 
 class _Backward(typing.NamedTuple):
-    tile: Int[Array, " l"]
-    position: Int[Array, " l"]
+    work: lanes.Work
     transmittance: Float[Array, "l p"]
     behind: Float[Array, "l p"]
-    taken: Int[Array, ""]
     gradient: Float[Array, "n k"]
+    rows: Float[Array, "l+1 s k"]
+    weights: Float[Array, "l+1 c p"]
+    alphas: Float[Array, "l+1 s p"]
+    visibility: Float[Array, "l+1 s p"]
+    contributions: Float[Array, "l+1 s p"]
+    d_exponents: Float[Array, "l+1 s p"]
 
 
-def _forward(
-    table: Float[Array, "n k"], lists: TileLists, *, grid: TileGrid, lanes: int, steps: int
-) -> Float[Array, "t c p"]:
-    n_channels = table.shape[1] - _CHANNELS
-    queue = _queue(lists, lanes)
-    pixels = _pixels(grid)
-    spare = grid.tiles + jnp.arange(lanes, dtype=jnp.int32)
-
-    def iterate(s: _Forward) -> _Forward:
-        rows, _ = _read(table, lists, queue, s.tile, s.position, steps)
-        alphas = _alphas(rows, pixels, grid.corners(s.tile))
-        through = 1 - alphas
-        channels = []
-        for c in range(n_channels):
-            # Horner's scheme over the entries, back to front: one product less per entry than summing up weights.
-            color = rows[_CHANNELS + c][..., None]
-            mixed = alphas[steps - 1] * color[steps - 1]
-            for k in reversed(range(steps - 1)):
-                mixed = mixed + alphas[k] * (color[k] - mixed)
-            channels.append(s.channels[c] + s.transmittance * mixed)
-        transmittance = s.transmittance
-        for k in range(steps):
-            transmittance = transmittance * through[k]
-        position = s.position + steps
-        done = _done(s.tile, position, transmittance, queue, grid)
-        # Lanes that are not done write behind the image: a scatter to distinct places is cheaper than a select.
-        block = jnp.stack([*channels, transmittance], axis=1)
-        out = s.out.at[jnp.where(done, s.tile, spare)].set(block, unique_indices=True, mode="promise_in_bounds")
-        tile, taken = _refill(done, s.tile, s.taken, queue)
-        fresh = done[:, None]
-        return _Forward(
-            tile=tile,
-            position=jnp.where(done, queue.starts[tile], position),
-            transmittance=jnp.where(fresh, 1.0, transmittance),
-            channels=[jnp.where(fresh, 0.0, c) for c in channels],
-            taken=taken,
-            out=out,
-        )
-
-    empty = jnp.zeros((n_channels + 1,), jnp.float32).at[n_channels].set(1.0)
-    tile = queue.order[:lanes]
-    dark = jnp.zeros((lanes, grid.tile_pixels), jnp.float32)
-    first = _Forward(
-        tile=tile,
-        position=queue.starts[tile],
-        transmittance=dark + 1,
-        channels=[dark] * n_channels,
-        taken=jnp.int32(lanes),
-        out=jnp.broadcast_to(empty[None, :, None], (grid.tiles + lanes, n_channels + 1, grid.tile_pixels)),
-    )
-    return lax.while_loop(lambda s: jnp.any(s.tile < grid.tiles), iterate, first).out[: grid.tiles]
-
-
+@_over_scenes
 def _backward(
     table: Float[Array, "n k"],
-    lists: TileLists,
+    ids: Int[Array, " m"],
+    starts: Int[Array, " t"],
+    ends: Int[Array, " t"],
+    corners: Float[Array, "t 2"],
     blended: Float[Array, "t c p"],
     cotangent: Float[Array, "t c p"],
     *,
-    grid: TileGrid,
-    lanes: int,
-    steps: int,
+    config: SplatConfig,
 ) -> Float[Array, "n k"]:
     """Gradient of the table. What matters of the channels is their product with the cotangent, one number a pixel."""
-    n_channels = table.shape[1] - _CHANNELS
-    queue = _queue(lists, lanes)
-    pixels = _pixels(grid)
-    monomials = _monomials(grid)
+    lists = lanes.Lists(ids, starts, ends)
+    n_tiles, n_channels = starts.shape[0], table.shape[1] - CHANNELS
+    n_lanes, steps = lanes.number(config.backward_lanes, n_tiles), config.backward_steps
+    pixels, monomials = jnp.asarray(_pixels(config), jnp.float32), _monomials(config)
+    center = jnp.asarray([config.tile_width / 2, config.tile_height / 2], jnp.float32)
+    queue, work = lanes.start(lists, n_lanes)
     # One more tile, for lanes without work.
+    corners = jnp.pad(corners, ((0, 1), (0, 0)))
     behind = jnp.pad(jnp.sum(blended * cotangent, axis=1), ((0, 1), (0, 0)))
     weights = jnp.pad(cotangent[:, :n_channels], ((0, 1), (0, 0), (0, 0)))
 
     def iterate(s: _Backward) -> _Backward:
-        rows, ids = _read(table, lists, queue, s.tile, s.position, steps)
-        corners = grid.corners(s.tile)
-        alphas = _alphas(rows, pixels, corners)
-        v = weights[s.tile]
-        transmittance, behind_entry = s.transmittance, s.behind
-        visibility, d_exponent = [], []
-        for k in range(steps):
-            alpha = alphas[k]
-            visible = transmittance * alpha
-            transmittance = transmittance * (1 - alpha)
-            value = sum(rows[_CHANNELS + c][k][:, None] * v[:, c] for c in range(n_channels))
-            contribution = visible * value
-            behind_entry = behind_entry - contribution
-            visibility.append(visible)
-            # d alpha / d exponent is alpha, and 0 where alpha is clamped.
-            slope = contribution - behind_entry * (alpha / (1 - alpha))
-            d_exponent.append(jnp.where(alpha < ALPHA_MAX, slope, 0.0))
+        chosen = lanes.entries(s.work, queue, lists, steps, table.shape[0] - 1)
+        corner = corners[s.work.tile]
+        rows = lanes.in_place(s.rows, table.at[chosen].get(mode="promise_in_bounds"), s.work)
+        entry = rows[:-1]
+        v = lanes.in_place(s.weights, weights[s.work.tile], s.work)
+        alphas = lanes.in_place(s.alphas, _alphas(entry, pixels, corner), s.work)
+        alpha = alphas[:-1]
+        before, through = _exclusive(jnp.multiply, 1 - alpha, 1.0)
+        visibility = lanes.in_place(s.visibility, s.transmittance[:, None] * before * alpha, s.work)
+        value = sum(entry[..., CHANNELS + c, None] * v[:-1, None, c] for c in range(n_channels))
+        contributions = lanes.in_place(s.contributions, visibility[:-1] * value, s.work)
+        contribution = contributions[:-1]
+        in_front, total = _exclusive(jnp.add, contribution, 0.0)
+        # d alpha / d log2(alpha) is alpha ln 2 (the logarithm is in the monomials), and 0 where alpha is clamped.
+        behind_entry = s.behind[:, None] - in_front - contribution
+        slope = contribution - behind_entry * (alpha / (1 - alpha))
+        d_exponents = lanes.in_place(s.d_exponents, jnp.where(alpha < ALPHA_MAX, slope, 0.0), s.work)
         # Sums over the pixels of a tile are matrix products.
-        moments = jnp.dot(jnp.stack(d_exponent).reshape(steps * lanes, -1), monomials).reshape(steps, lanes, 6)
-        d_channels = jnp.matmul(jnp.stack(visibility).transpose(1, 0, 2), v.transpose(0, 2, 1)).transpose(1, 0, 2)
-        d_rows = [*_exponent_gradients(rows, corners, moments, grid), *jnp.moveaxis(d_channels, -1, 0)]
-        d_rows = jnp.stack(d_rows, axis=-1).reshape(steps * lanes, -1)
-        gradient = s.gradient.at[ids.reshape(-1)].add(d_rows, mode="promise_in_bounds")
-        position = s.position + steps
-        done = _done(s.tile, position, transmittance, queue, grid)
-        tile, taken = _refill(done, s.tile, s.taken, queue)
-        fresh = done[:, None]
+        moments = jnp.dot(d_exponents.reshape((n_lanes + 1) * steps, -1), monomials)
+        moments = moments.reshape(n_lanes + 1, steps, 6)[:-1]
+        d_channels = jnp.matmul(visibility, v.mT)[:-1]
+        d_rows = [*_exponent_gradients(entry, corner + center[None], moments), d_channels]
+        d_rows = jnp.concatenate(d_rows, axis=-1).reshape(n_lanes * steps, -1)
+        transmittance = s.transmittance * through
+        done, work = lanes.advance(s.work, queue, steps, transmittance)
         return _Backward(
-            tile=tile,
-            position=jnp.where(done, queue.starts[tile], position),
-            transmittance=jnp.where(fresh, 1.0, transmittance),
-            behind=jnp.where(fresh, behind[tile], behind_entry),
-            taken=taken,
-            gradient=gradient,
+            work=work,
+            transmittance=jnp.where(done[:, None], 1.0, transmittance),
+            behind=jnp.where(done[:, None], behind[work.tile], s.behind - total),
+            gradient=s.gradient.at[chosen.reshape(-1)].add(d_rows, mode="promise_in_bounds"),
+            rows=rows,
+            weights=v,
+            alphas=alphas,
+            visibility=visibility,
+            contributions=contributions,
+            d_exponents=d_exponents,
         )
 
-    tile = queue.order[:lanes]
+    n_pixels = pixels.shape[0]
+    block = jnp.zeros((n_lanes + 1, steps, n_pixels), jnp.float32)
     first = _Backward(
-        tile=tile,
-        position=queue.starts[tile],
-        transmittance=jnp.ones((lanes, grid.tile_pixels), jnp.float32),
-        behind=behind[tile],
-        taken=jnp.int32(lanes),
+        work=work,
+        transmittance=jnp.ones((n_lanes, n_pixels), jnp.float32),
+        behind=behind[work.tile],
         gradient=jnp.zeros_like(table),
+        rows=jnp.zeros((n_lanes + 1, steps, table.shape[1]), jnp.float32),
+        weights=jnp.zeros((n_lanes + 1, n_channels, n_pixels), jnp.float32),
+        alphas=block,
+        visibility=block,
+        contributions=block,
+        d_exponents=block,
     )
-    return lax.while_loop(lambda s: jnp.any(s.tile < grid.tiles), iterate, first).gradient
+    return lax.while_loop(lambda s: lanes.busy(s.work, queue), iterate, first).gradient
 
 
-def _queue(lists: TileLists, lanes: int) -> _Queue:
-    lengths = lists.ends - lists.starts
-    n_tiles = lengths.shape[0]
-    order = jnp.argsort(-lengths).astype(jnp.int32)
-    order = jnp.where(lengths[order] > 0, order, n_tiles)
-    order = jnp.pad(order, (0, 2 * lanes), constant_values=n_tiles)
-    return _Queue(order, jnp.pad(lists.starts, (0, 1)), jnp.pad(lists.ends, (0, 1)))
+def _exclusive(
+    combine: typing.Any, x: Float[Array, "l s p"], neutral: float
+) -> tuple[Float[Array, "l s p"], Float[Array, "l p"]]:
+    """Sum or product along s of all before each element, and of all.
+
+    Each element is combined from the others, masked, in groups of four: more arithmetic than a running sum, but it
+    is one vectorised loop, where XLA on CPU stacks running sums element by element.
+    """
+    n_lanes, steps, n_pixels = x.shape
+    group = 4 if steps % 4 == 0 else steps
+    x = x.reshape(n_lanes, steps // group, group, n_pixels)
+    within, totals = _exclusive_masked(combine, x, neutral)
+    if steps == group:
+        return within[:, 0], totals[:, 0]
+    before, total = _exclusive_masked(combine, totals[:, None], neutral)
+    return combine(within, before[:, 0, :, None]).reshape(n_lanes, steps, n_pixels), total[:, 0]
 
 
-def _refill(
-    done: Bool[Array, " l"], tile: Int[Array, " l"], taken: Int[Array, ""], queue: _Queue
-) -> tuple[Int[Array, " l"], Int[Array, ""]]:
-    """Give the lanes that are done the next tiles of the queue."""
-    place = taken + jnp.cumsum(done, dtype=jnp.int32) - 1
-    following = queue.order[jnp.minimum(place, queue.order.shape[0] - 1)]
-    return jnp.where(done, following, tile), taken + jnp.sum(done, dtype=jnp.int32)
+def _exclusive_masked(
+    combine: typing.Any, x: Float[Array, "l g s p"], neutral: float
+) -> tuple[Float[Array, "l g s p"], Float[Array, "l g p"]]:
+    steps = x.shape[2]
+    index = np.arange(steps)[None, None, :, None]
+    before, total = jnp.full_like(x, neutral), x[:, :, 0]
+    for k in range(steps - 1):
+        before = combine(before, jnp.where(k < index, x[:, :, k : k + 1], neutral))
+        total = combine(total, x[:, :, k + 1])
+    return before, total
 
 
-def _done(
-    tile: Int[Array, " l"],
-    position: Int[Array, " l"],
-    transmittance: Float[Array, "l p"],
-    queue: _Queue,
-    grid: TileGrid,
-) -> Bool[Array, " l"]:
-    opaque = jnp.max(transmittance, axis=-1) <= TRANSMITTANCE_MIN
-    return ((position >= queue.ends[tile]) | opaque) & (tile < grid.tiles)
-
-
-def _read(
-    table: Float[Array, "n k"],
-    lists: TileLists,
-    queue: _Queue,
-    tile: Int[Array, " l"],
-    position: Int[Array, " l"],
-    steps: int,
-) -> tuple[list[Float[Array, "s l"]], Int[Array, "s l"]]:
-    """Columns of the next entries of each lane and their indices; past the end of a list, the transparent row."""
-    entries = position[None] + jnp.arange(steps, dtype=jnp.int32)[:, None]
-    ids = lists.ids[jnp.minimum(entries, lists.ids.shape[0] - 1)]
-    ids = jnp.where(entries < queue.ends[tile][None], ids, table.shape[0] - 1)
-    rows = table[ids]
-    return [rows[..., k] for k in range(table.shape[1])], ids
-
-
-def _pixels(grid: TileGrid) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-    x, y = grid.pixel_centers()
-    return jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
+def _pixels(config: SplatConfig) -> np.ndarray:
+    """Pixel centres (p, 2) of a tile, relative to its corner."""
+    index = np.arange(config.tile_width * config.tile_height)
+    return np.stack([index % config.tile_width, index // config.tile_width], axis=1) + np.float32(0.5)
 
 
 def _alphas(
-    rows: list[Float[Array, "s l"]],
-    pixels: tuple[Float[Array, " p"], Float[Array, " p"]],
-    corners: tuple[Float[Array, " l"], Float[Array, " l"]],
-) -> Float[Array, "s l p"]:
-    dx = pixels[0][None, None] - (rows[_X] - corners[0][None])[..., None]
-    dy = pixels[1][None, None] - (rows[_Y] - corners[1][None])[..., None]
-    xx, xy, yy = rows[_XX][..., None], rows[_XY][..., None], rows[_YY][..., None]
-    alpha = _exp(rows[_LOG_OPACITY][..., None] + (xx * dx + xy * dy) * dx + yy * dy * dy)
+    entry: Float[Array, "l s k"], pixels: Float[Array, "p 2"], corner: Float[Array, "l 2"]
+) -> Float[Array, "l s p"]:
+    column = [entry[..., k, None] for k in range(CHANNELS)]
+    dx = pixels[None, None, :, 0] - (column[X] - corner[:, :1, None])
+    dy = pixels[None, None, :, 1] - (column[Y] - corner[:, 1:, None])
+    alpha = _exp2(column[LOG2_OPACITY] + (column[XX] * dx + column[XY] * dy) * dx + column[YY] * dy * dy)
     return jnp.where(alpha >= ALPHA_MIN, jnp.minimum(alpha, ALPHA_MAX), 0.0)
 
 
-def _exp(x: Float[Array, "s l p"]) -> Float[Array, "s l p"]:
-    """exp on [-6, 0], to which x is clamped: exp(-6) is below ALPHA_MIN, and opacity is at most 1.
-
-    The (3, 3) Pade approximant of exp(x / 16) to the 16th power, relative error about 1e-6. It vectorises where
-    XLA's own exp does not, and it is about twice as fast on CPU.
-    """
-    y = jnp.clip(x, -6.0, 0.0) * (1 / 16)
-    square = y * y
-    even, odd = 120 + 12 * square, y * (60 + square)
-    r = (even + odd) / (even - odd)
-    r = r * r
-    r = r * r
-    r = r * r
-    return r * r
+# Minimax polynomial of 2^x on [-1/2, 1/2], relative error 7.5e-8.
+_EXP2 = (1.0000000717, 0.6931469670, 0.2402211973, 0.0555071331, 0.0096755412, 0.0013276460)
+# Adding 1.5 * 2^23 leaves the nearest integer in the low bits of a float.
+_ROUND = np.float32(1.5 * 2**23)
 
 
-def _monomials(grid: TileGrid) -> Float[Array, "p 6"]:
-    """1, x, y, x^2, x y, y^2 of the pixel centres relative to the centre of the tile, where they are smallest."""
-    x, y = grid.pixel_centers()
-    x, y = x - grid.tile_width / 2, y - grid.tile_height / 2
-    return jnp.asarray(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1), jnp.float32)
+def _exp2(x: Float[Array, "l s p"]) -> Float[Array, "l s p"]:
+    """2^x for x up to 1; below -9, where 2^x is less than ALPHA_MIN, 2^-9. Twice as fast as XLA's own on CPU."""
+    x = jnp.maximum(x, -9.0)
+    bits = lax.bitcast_convert_type(x + _ROUND, jnp.int32)
+    fraction = x - (bits - _ROUND.view(np.int32)).astype(jnp.float32)
+    power = jnp.full_like(x, _EXP2[-1])
+    for c in _EXP2[-2::-1]:
+        power = power * fraction + c
+    # The integer goes into the exponent of the float.
+    exponent = lax.shift_left(bits, jnp.int32(23))
+    return lax.bitcast_convert_type(lax.bitcast_convert_type(power, jnp.int32) + exponent, jnp.float32)
+
+
+def _monomials(config: SplatConfig) -> Float[Array, "p 6"]:
+    """1, x, y, x^2, x y, y^2 of the pixel centres relative to the centre of the tile, where they are smallest; times
+    ln 2, the slope of 2^x."""
+    x, y = _pixels(config).T
+    x, y = x - config.tile_width / 2, y - config.tile_height / 2
+    return jnp.asarray(math.log(2) * np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1), jnp.float32)
 
 
 def _exponent_gradients(
-    rows: list[Float[Array, "s l"]],
-    corners: tuple[Float[Array, " l"], Float[Array, " l"]],
-    moments: Float[Array, "s l 6"],
-    grid: TileGrid,
-) -> list[Float[Array, "s l"]]:
-    """Gradients of centre, conic and log opacity from the moments of the gradient of the exponent over the pixels."""
-    x = rows[_X] - (corners[0] + grid.tile_width / 2)[None]
-    y = rows[_Y] - (corners[1] + grid.tile_height / 2)[None]
-    m, mx, my, mxx, mxy, myy = (moments[..., k] for k in range(6))
+    entry: Float[Array, "l s k"], center: Float[Array, "l 2"], moments: Float[Array, "l s 6"]
+) -> list[Float[Array, "l s 1"]]:
+    """Gradients of centre, conic and log opacity from the moments, about `center`, of the gradient of the exponent."""
+    m, mx, my, mxx, mxy, myy = (moments[..., k : k + 1] for k in range(6))
+    x, y = (entry[..., k : k + 1] - center[:, k, None, None] for k in (X, Y))
     # Moments about the centre of the Gaussian.
     dx, dy = mx - x * m, my - y * m
     dxx = mxx - 2 * x * mx + x * x * m
     dxy = mxy - x * my - y * mx + x * y * m
     dyy = myy - 2 * y * my + y * y * m
-    xx, xy, yy = -2 * rows[_XX], -rows[_XY], -2 * rows[_YY]
-    return [xx * dx + xy * dy, xy * dx + yy * dy, dxx, dxy, dyy, m]
+    xx, xy, yy = (entry[..., k : k + 1] for k in (XX, XY, YY))
+    return [-2 * xx * dx - xy * dy, -xy * dx - 2 * yy * dy, dxx, dxy, dyy, m]

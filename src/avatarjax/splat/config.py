@@ -18,10 +18,16 @@ CAPACITY_MAX = 2**24
 class SplatConfig:
     """Static settings of `render`; hashable, so that it can be a static argument of `jax.jit`.
 
-    capacity: room for (Gaussian, tile) intersections; None takes `default_capacity`. What does not fit is dropped,
-    farthest first, and counted in `RenderInfo.dropped`; `required_capacity` gives a value that fits a scene.
+    capacity: room for the tiles in the bounding boxes of all Gaussians; None takes `default_capacity`. What does not
+    fit is dropped, farthest first, and counted in `RenderInfo.dropped`; `required_capacity` gives a value that fits a
+    scene.
     near: Gaussians whose centre is nearer to the image plane than this many metres are not drawn.
     eps2d: variance in square pixels added to each axis of a projected Gaussian (0.3 as in gsplat).
+    antialiased: take from the opacity of small Gaussians what `eps2d` adds to their area (Mip-Splatting, Yu et al.
+    2024), so that they do not grow brighter as they move away.
+    cull_ellipses: leave out tiles in the corners of bounding boxes that the ellipses do not reach. Changes no picture;
+    pays for long, thin Gaussians, and costs a few percent where they are round.
+    shards: devices that share an image, row of tiles by row of tiles; on CPU, start with `jax_num_cpu_devices` set.
     tile_width, tile_height: pixels. forward_lanes, backward_lanes: tiles in flight at once (small images take fewer).
     forward_steps, backward_steps: list entries that a lane blends per iteration. The defaults are the fastest that
     were measured on two CPU cores.
@@ -30,6 +36,9 @@ class SplatConfig:
     capacity: int | None = None
     near: float = 0.01
     eps2d: float = 0.3
+    antialiased: bool = False
+    cull_ellipses: bool = False
+    shards: int = 1
     tile_width: int = 8
     tile_height: int = 4
     forward_lanes: int = 128
@@ -40,7 +49,15 @@ class SplatConfig:
     def __post_init__(self) -> None:
         if self.capacity is not None and not 0 < self.capacity <= CAPACITY_MAX:
             raise ValueError(f"capacity must be in 1..{CAPACITY_MAX} or None, got {self.capacity}")
-        for name in ("tile_width", "tile_height", "forward_lanes", "forward_steps", "backward_lanes", "backward_steps"):
+        for name in (
+            "shards",
+            "tile_width",
+            "tile_height",
+            "forward_lanes",
+            "forward_steps",
+            "backward_lanes",
+            "backward_steps",
+        ):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.near <= 0 or self.eps2d <= 0:

@@ -5,49 +5,51 @@ Everything is written per component: XLA on CPU is slow at batches of 3x3 produc
 
 from __future__ import annotations
 
+import math
 import typing
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from avatarjax import rotations
 from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
 from avatarjax.splat import columns
-from avatarjax.splat.config import SplatConfig
+from avatarjax.splat.config import ALPHA_MIN, SplatConfig
 
 # Square pixels. The determinant of larger covariances would come near the largest float32.
 _VARIANCE_MAX = 1e15
+_LOG2_E = math.log2(math.e)
+
+
+# Columns of `Splats.table`. From CHANNELS on come the features, then the depth.
+X, Y, XX, XY, YY, LOG2_OPACITY, CHANNELS = range(7)
 
 
 class Splats(typing.NamedTuple):
-    """n projected Gaussians; all values of those that are not `valid` are finite and without meaning.
+    """n projected Gaussians; those that are not drawn have finite values without meaning and no extent.
 
-    x, y: centre in pixels. conic_xx, conic_xy, conic_yy: inverse of the 2D covariance, 1/pixel^2. variance_x,
-    variance_y: diagonal of the 2D covariance, pixel^2. log_opacity: natural logarithm. depth: metres along the optical
-    axis. valid: finite and in front of the near plane. finite: free of NaN, infinity and overflow.
+    table: a row each, which the blending reads at once. Centre in pixels; the base-2 logarithm of alpha at (dx, dy)
+    pixels from it as XX dx^2 + XY dx dy + YY dy^2 + LOG2_OPACITY; the features; the depth, metres along the optical
+    axis.
+    extents: half the sides, in pixels, of the bounding box of the ellipse in which alpha is at least ALPHA_MIN; not
+    differentiable.
     """
 
-    x: Float[Array, " n"]
-    y: Float[Array, " n"]
-    conic_xx: Float[Array, " n"]
-    conic_xy: Float[Array, " n"]
-    conic_yy: Float[Array, " n"]
-    variance_x: Float[Array, " n"]
-    variance_y: Float[Array, " n"]
-    log_opacity: Float[Array, " n"]
-    depth: Float[Array, " n"]
-    valid: Bool[Array, " n"]
-    finite: Bool[Array, " n"]
+    table: Float[Array, "n k"]
+    extents: Float[Array, "n 2"]
 
 
-def project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> Splats:
-    """Project a cloud of n Gaussians into one camera.
+def project(
+    gaussians: Gaussians, features: Float[Array, "n d"], camera: Camera, config: SplatConfig
+) -> tuple[Splats, Bool[Array, " n"]]:
+    """Project a cloud of n Gaussians into one camera, and tell which of them are free of NaN, infinity and overflow.
 
     The perspective is linearised at each centre, which is first moved to within 1.3 times the field of view: farther
     out the linearisation would spread a Gaussian over the whole image (Kerbl et al. 2023, and gsplat).
     """
-    finite = _finite(gaussians)
+    finite = _finite(gaussians, features)
     # Masked values go in, not only out: the gradient of a masked result is 0 * NaN otherwise.
     x, y, z = (jnp.where(finite, x, 0.0) for x in columns.split(gaussians.means))
     scales = [jnp.exp(jnp.where(finite, s, 0.0)) for s in columns.split(gaussians.log_scales)]
@@ -83,25 +85,26 @@ def project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> Splats
     crosses = [ax[0] * ay[1] - ax[1] * ay[0], ax[1] * ay[2] - ax[2] * ay[1], ax[2] * ay[0] - ax[0] * ay[2]]
     determinant = sum(c * c for c in crosses) + config.eps2d * (variance_x + variance_y - config.eps2d)
     inverse = 1 / jnp.where(bounded, determinant, 1.0)
-    return Splats(
-        x=fx * slope_x + cx,
-        y=fy * slope_y + cy,
-        conic_xx=variance_y * inverse,
-        conic_xy=-covariance * inverse,
-        conic_yy=variance_x * inverse,
-        variance_x=variance_x,
-        variance_y=variance_y,
-        log_opacity=_log_opacities(jnp.where(finite, gaussians.logit_opacities, 0.0)),
-        depth=depth,
-        valid=finite & in_front & bounded,
-        finite=finite & (bounded | ~in_front),
-    )
+    log_opacity = _log_opacities(jnp.where(finite, gaussians.logit_opacities, 0.0))
+    if config.antialiased:
+        # What the blur adds to the area it takes from the opacity. Less than ALPHA_MIN^2 is invisible in any case.
+        ratio = sum(c * c for c in crosses) * inverse
+        log_opacity = log_opacity + 0.5 * jnp.log(jnp.maximum(ratio, 0.5 * ALPHA_MIN**2))
+    reach = jnp.where(finite & in_front & bounded, 2 * (log_opacity - math.log(ALPHA_MIN)), 0.0)
+    reach = lax.stop_gradient(jnp.maximum(reach, 0.0))
+    conic = [-0.5 * variance_y * inverse, covariance * inverse, -0.5 * variance_x * inverse]
+    center = [fx * slope_x + cx, fy * slope_y + cy]
+    logarithms = [_LOG2_E * c for c in (*conic, log_opacity)]
+    extents = [jnp.sqrt(reach * lax.stop_gradient(v)) for v in (variance_x, variance_y)]
+    channels = [jnp.where(finite, f, 0.0) for f in columns.split(features)]
+    table = columns.join([*center, *logarithms, *channels, depth])
+    return Splats(table, columns.join(extents)), finite & (bounded | ~in_front)
 
 
-def _finite(gaussians: Gaussians) -> Bool[Array, " n"]:
+def _finite(gaussians: Gaussians, features: Float[Array, "n d"]) -> Bool[Array, " n"]:
     """False for a Gaussian with a NaN or infinite parameter; an infinite logit is only an opacity of 0 or 1."""
-    # Reductions, though over three numbers: XLA computes them once, and not again in all that depends on them.
-    rows = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.colors)
+    # Reductions, though over few numbers: XLA computes them once, and not again in all that depends on them.
+    rows = (gaussians.means, gaussians.quats, gaussians.scales, features)
     finite = ~jnp.isnan(gaussians.logit_opacities)
     for row in rows:
         finite &= jnp.all(jnp.isfinite(row), axis=1)

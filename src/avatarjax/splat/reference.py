@@ -13,6 +13,7 @@ from avatarjax import rotations
 from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
 from avatarjax.splat.config import ALPHA_MAX, ALPHA_MIN, SplatConfig
+from avatarjax.splat.sh import view_colors
 
 
 class ReferenceOutput(typing.NamedTuple):
@@ -28,6 +29,7 @@ def render_reference(
     camera: Camera,
     *,
     background: ArrayLike = 0.0,
+    features: Float[Array, "n d"] | None = None,
     config: SplatConfig = SplatConfig(),
 ) -> ReferenceOutput:
     """What `render` computes, in the dtype of its input and with memory for n times h times w numbers.
@@ -35,21 +37,23 @@ def render_reference(
     Give it float64 inside `jax.enable_x64` for an oracle. It never stops early and knows no capacity; all Gaussians
     must be finite.
     """
-    centers, inverse_covariances, depths = _project(gaussians, camera, config)
+    if features is None:
+        features = view_colors(gaussians, camera)
+    centers, inverse_covariances, depths, opacities = _project(gaussians, camera, config)
     in_front = depths > config.near
     order = jnp.argsort(jnp.where(in_front, depths, jnp.inf))
     x, y = jnp.meshgrid(jnp.arange(camera.width) + 0.5, jnp.arange(camera.height) + 0.5)
     pixels = jnp.stack([x, y], axis=-1).astype(centers.dtype)
     offsets = pixels[None] - centers[:, None, None]
     exponents = -0.5 * jnp.einsum("nhwi,nij,nhwj->nhw", offsets, inverse_covariances, offsets)
-    alphas = jnp.minimum(gaussians.opacities[:, None, None] * jnp.exp(exponents), ALPHA_MAX)
+    alphas = jnp.minimum(opacities[:, None, None] * jnp.exp(exponents), ALPHA_MAX)
     alphas = jnp.where((alphas >= ALPHA_MIN) & in_front[:, None, None], alphas, 0)[order]
     behind = jnp.cumprod(1 - alphas, axis=0)
     before = jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])
     weights = alphas * before
     alpha = 1 - behind[-1]
-    background = jnp.broadcast_to(jnp.asarray(background, centers.dtype), gaussians.colors.shape[1:])
-    image = jnp.einsum("nhw,nc->hwc", weights, gaussians.colors[order])
+    background = jnp.broadcast_to(jnp.asarray(background, centers.dtype), features.shape[1:])
+    image = jnp.einsum("nhw,nc->hwc", weights, features[order])
     image = image + behind[-1][..., None] * background[None, None]
     depth = jnp.einsum("nhw,n->hw", weights, depths[order])
     return ReferenceOutput(image, alpha, jnp.where(alpha > 0, depth / jnp.where(alpha > 0, alpha, 1), 0))
@@ -57,8 +61,8 @@ def render_reference(
 
 def _project(
     gaussians: Gaussians, camera: Camera, config: SplatConfig
-) -> tuple[Float[Array, "n 2"], Float[Array, "n 2 2"], Float[Array, " n"]]:
-    """Centres in pixels, inverse 2D covariances and depths; those behind the camera are without meaning."""
+) -> tuple[Float[Array, "n 2"], Float[Array, "n 2 2"], Float[Array, " n"], Float[Array, " n"]]:
+    """Centres in pixels, inverse 2D covariances, depths and opacities; those behind the camera are without meaning."""
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     focal = jnp.diagonal(camera.intrinsics)[:2]
     principal = camera.intrinsics[:2, 2]
@@ -73,5 +77,9 @@ def _project(
     jacobian = jnp.concatenate([jax.vmap(jnp.diag)(focal[None] / z), (-focal[None] * bounded / z)[..., None]], axis=-1)
     axes = rotations.to_matrix(gaussians.quats) * gaussians.scales[:, None, :]
     on_image = jnp.einsum("nij,jk,nkl->nil", jacobian, rotation, axes)
-    covariances = on_image @ on_image.mT + config.eps2d * jnp.eye(2, dtype=points.dtype)[None]
-    return focal[None] * slopes + principal[None], jnp.linalg.inv(covariances), depths
+    sharp = on_image @ on_image.mT
+    blurred = sharp + config.eps2d * jnp.eye(2, dtype=points.dtype)[None]
+    opacities = gaussians.opacities
+    if config.antialiased:
+        opacities = opacities * jnp.sqrt(jnp.maximum(jnp.linalg.det(sharp) / jnp.linalg.det(blurred), 1e-12))
+    return focal[None] * slopes + principal[None], jnp.linalg.inv(blurred), depths, opacities

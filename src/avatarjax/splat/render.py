@@ -14,10 +14,11 @@ from jaxtyping import Array, Float, Int
 
 from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
-from avatarjax.splat import columns, tiles
-from avatarjax.splat.blend import blend, fields_of
+from avatarjax.splat import sharding, tiles
+from avatarjax.splat.blend import blend
 from avatarjax.splat.config import CAPACITY_MAX, SplatConfig, default_capacity
 from avatarjax.splat.project import project
+from avatarjax.splat.sh import view_colors
 
 
 @typing.no_type_check
@@ -39,10 +40,10 @@ class RenderInfo:
 @typing.no_type_check
 @flax.struct.dataclass
 class RenderOutput:
-    """image (h, w, 3) over the background, in the space of the Gaussians' colours; alpha (h, w) in [0, 1]; depth (h, w)
-    metres, the mean depth of what a pixel shows, 0 where it shows nothing; info."""
+    """image (h, w, d) over the background, in the space of the colours or features; alpha (h, w) in [0, 1]; depth
+    (h, w) metres, the mean depth of what a pixel shows, 0 where it shows nothing; info."""
 
-    image: Float[Array, "h w 3"]
+    image: Float[Array, "h w d"]
     alpha: Float[Array, "h w"]
     depth: Float[Array, "h w"]
     info: RenderInfo
@@ -53,21 +54,29 @@ def render(
     camera: Camera,
     *,
     background: ArrayLike = 0.0,
+    features: Float[Array, "n d"] | None = None,
     config: SplatConfig = SplatConfig(),
 ) -> RenderOutput:
     """Draw a cloud by 3D Gaussian splatting (Kerbl et al. 2023), differentiable in the cloud, camera and background.
 
-    gaussians: one cloud of n >= 0; camera: one camera; `jax.vmap` over either renders batches. background: a scalar or
-    (3,). Gaussians behind the near plane are not drawn; what did not fit or was not finite is counted in `info`.
-    Opaque tiles are finished early, which leaves out at most 1e-4 of the light.
+    gaussians: one cloud of n >= 0; camera: one camera; `jax.vmap` over either renders batches. features: (n, d) of any
+    d >= 1 to draw in place of the colours; None draws what the camera sees of `colors` and `sh` (`view_colors`).
+    background: a scalar or (d,). Gaussians behind the near plane are not drawn; what did not fit or was not finite is
+    counted in `info`. Opaque tiles are finished early, which leaves out at most 1e-4 of the light.
 
-    Raises ValueError for batched, wrongly shaped or non-float32 input, and for clouds with spherical harmonics.
+    Reverse-mode derivatives are exact; `jax.jvp` and second derivatives raise TypeError (use
+    `splat.reference.render_reference` for those). Raises ValueError for batched, wrongly shaped or non-float32 input,
+    and where `config.shards` is more than the devices there are.
     """
     _check(gaussians, camera)
+    if features is None:
+        features = gaussians.colors if gaussians.sh is None else view_colors(gaussians, camera)
+    _check_array("features", features, (len(gaussians), features.shape[-1] if features.ndim else None))
+    channels = features.shape[1]
     background = jnp.asarray(background, jnp.float32)
-    if background.shape not in ((), (3,)):
-        raise ValueError(f"background must be a scalar or have shape (3,), got {background.shape}")
-    return _render(gaussians, camera, jnp.broadcast_to(background, (3,)), config)
+    if background.shape not in ((), (channels,)):
+        raise ValueError(f"background must be a scalar or have shape ({channels},), got {background.shape}")
+    return _render(gaussians, features, camera, jnp.broadcast_to(background, (channels,)), config)
 
 
 def required_capacity(
@@ -82,7 +91,7 @@ def required_capacity(
     """
     views = jax.tree.map(lambda x: x.reshape(-1, *x.shape[-2:]), camera)
     _check(gaussians, jax.tree.map(lambda x: x[0], views))
-    total = int(jnp.max(_count(gaussians, views, config))) if len(gaussians) else 0
+    total = int(jnp.max(_count(gaussians, views, config))) * config.shards if len(gaussians) else 0
     if total > CAPACITY_MAX:
         raise ValueError(
             f"{total} intersections are more than {CAPACITY_MAX}: use fewer or smaller Gaussians, or tiles"
@@ -92,49 +101,76 @@ def required_capacity(
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _render(gaussians: Gaussians, camera: Camera, background: Float[Array, " 3"], config: SplatConfig) -> RenderOutput:
+def _render(
+    gaussians: Gaussians,
+    features: Float[Array, "n d"],
+    camera: Camera,
+    background: Float[Array, " d"],
+    config: SplatConfig,
+) -> RenderOutput:
     if len(gaussians) == 0:
         return _nothing(camera, background)
     grid = _grid(camera, config)
-    capacity = config.capacity or default_capacity(len(gaussians), grid.tiles)
-    splats = project(gaussians, camera, config)
-    lists = tiles.bin_splats(splats, grid, capacity)
-    channels = [*columns.split(gaussians.colors), splats.depth]
-    blended = grid.assemble(blend(fields_of(splats, channels), lists, grid, config))
-    colors, depth, transmittance = blended[..., :3], blended[..., 3], blended[..., 4]
+    capacity = config.capacity or default_capacity(len(gaussians), grid.tiles * grid.shards)
+    draw = functools.partial(_draw, grid=grid, capacity=capacity, config=config)
+    blended, counts = sharding.over_rows(draw, config.shards)(gaussians, features, camera)
+    blended = grid.assemble(blended)
+    colors, depth, transmittance = blended[..., :-2], blended[..., -2], blended[..., -1]
     alpha = 1 - transmittance
     seen = alpha > 0
     return RenderOutput(
         image=colors + transmittance[..., None] * background[None, None],
         alpha=alpha,
         depth=jnp.where(seen, depth / jnp.where(seen, alpha, 1.0), 0.0),
-        info=RenderInfo(lists.total, lists.dropped, jnp.sum(~splats.finite, dtype=jnp.int32), capacity),
+        info=RenderInfo(*counts, capacity),
     )
 
 
+def _draw(
+    gaussians: Gaussians,
+    features: Float[Array, "n d"],
+    camera: Camera,
+    *,
+    grid: tiles.TileGrid,
+    capacity: int,
+    config: SplatConfig,
+) -> tuple[Float[Array, "t c p"], list[Int[Array, ""]]]:
+    """The blended tiles of a shard, which projects its part of the Gaussians; and intersections, those dropped, and the
+    Gaussians that are not finite, of all shards."""
+    splats, finite = project(gaussians, features, camera, config)
+    splats = sharding.gather(splats, config.shards)
+    shard = sharding.index(config.shards)
+    lists = tiles.bin_splats(splats, grid, -(-capacity // config.shards), shard, config.cull_ellipses)
+    blended = blend(splats.table, lists, grid.corners(shard), config)
+    counts = [lists.total, lists.dropped, jnp.sum(~finite, dtype=jnp.int32)]
+    return blended, [sharding.total(count, config.shards) for count in counts]
+
+
 @functools.partial(jax.jit, static_argnames="config")
-def _count(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> Int[Array, " v"]:
+def _count(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> Int[Array, "v s"]:
+    """Intersections in each view and shard."""
+
     def count(camera):
-        splats = project(gaussians, camera, config)
-        return tiles.count_intersections(splats, _grid(camera, config))
+        splats, _ = project(gaussians, gaussians.colors, camera, config)
+        grid = _grid(camera, config)
+        return jnp.stack([tiles.count_intersections(splats, grid, k) for k in range(config.shards)])
 
     return jax.lax.map(count, cameras)
 
 
 def _grid(camera: Camera, config: SplatConfig) -> tiles.TileGrid:
-    return tiles.TileGrid(camera.width, camera.height, config.tile_width, config.tile_height)
+    return tiles.TileGrid(camera.width, camera.height, config.tile_width, config.tile_height, config.shards)
 
 
-def _nothing(camera: Camera, background: Float[Array, " 3"]) -> RenderOutput:
+def _nothing(camera: Camera, background: Float[Array, " d"]) -> RenderOutput:
     size = (camera.height, camera.width)
     none = jnp.int32(0)
     info = RenderInfo(none, none, none, capacity=0)
-    return RenderOutput(jnp.broadcast_to(background, (*size, 3)), jnp.zeros(size), jnp.zeros(size), info)
+    image = jnp.broadcast_to(background, (*size, background.shape[0]))
+    return RenderOutput(image, jnp.zeros(size), jnp.zeros(size), info)
 
 
 def _check(gaussians: Gaussians, camera: Camera) -> None:
-    if gaussians.sh is not None:
-        raise ValueError("render draws plain colours: evaluate sh into colors first, and pass sh=None")
     n = gaussians.means.shape[0] if gaussians.means.ndim == 2 else None
     fields = {
         "means": (n, 3),

@@ -1,19 +1,24 @@
 """Stable sorts of small integers and of depths, in the form that is fast on each platform.
 
 `lax.sort` takes about 75 ns an element on XLA's CPU backend. A counting sort written as a scan over rows of independent
-columns, whose counters are updated in place, takes 4-5 ns. On other platforms its many small steps would each be a
+columns, whose counters are updated in place, takes 5-10 ns. On other platforms its many small steps would each be a
 kernel launch, and `lax.sort` is the fast way.
 """
 
 from __future__ import annotations
 
+import functools
+import typing
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-_BLOCK = 128
+from avatarjax.splat import columns
+
+_BLOCK = 32
 _DEPTH_BITS, _DEPTH_COLUMNS = 12, 32
-_KEY_COLUMNS = 64
+KEY_COLUMNS = 64
 _SATURATED = 2**30
 
 
@@ -23,7 +28,8 @@ def exclusive_sum(counts: Int[Array, " n"]) -> Int[Array, " n"]:
     Exact up to 2^24; larger sums are rounded and end at 2^30, so that they never wrap around. Products with a triangle
     of ones are several times as fast as `jnp.cumsum` on CPU.
     """
-    return jnp.minimum(_exclusive_sum(counts.astype(jnp.float32)), _SATURATED).astype(jnp.int32)
+    sums = jnp.minimum(_exclusive_sum(counts.astype(jnp.float32)), _SATURATED).astype(jnp.int32)
+    return columns.materialize(sums)
 
 
 def _exclusive_sum(x: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -34,8 +40,40 @@ def _exclusive_sum(x: Float[Array, " n"]) -> Float[Array, " n"]:
     inside = jnp.dot(rows, before, precision="highest")
     if blocks == 1:
         return inside[0, :n]
-    offsets = _exclusive_sum(jnp.sum(rows, axis=1))
+    offsets = _exclusive_sum(inside[:, -1] + rows[:, -1])
     return (inside + offsets[:, None]).reshape(-1)[:n]
+
+
+class Columns(typing.NamedTuple):
+    """How a counting sort lays n elements out: one after another down `columns` columns of `rows` elements.
+
+    Arrays in this layout are (rows, columns): a row, which is counted at once, lies together in memory.
+    """
+
+    n: int
+    rows: int
+    columns: int
+
+    @classmethod
+    def of(cls, n: int, columns: int) -> Columns:
+        """About `columns` columns: more take larger tables of counters, fewer more rows. The number of rows is odd: the
+        elements of a row come from as many parts of the cache."""
+        rows = -(-n // columns) | 1
+        return cls(n, rows, -(-n // rows))
+
+    @property
+    def elements(self) -> Int[Array, "r c"]:
+        """Which element is where."""
+        down = jnp.arange(self.rows, dtype=jnp.int32)[:, None]
+        return down + self.rows * jnp.arange(self.columns, dtype=jnp.int32)[None]
+
+    def lay(self, x: Int[Array, " n"], fill: int) -> Int[Array, "r c"]:
+        """From elements in order to this layout, with `fill` behind the last."""
+        return jnp.pad(x, (0, self.rows * self.columns - self.n), constant_values=fill).reshape(self.columns, -1).T
+
+    def flat(self, x: Int[Array, "r c"]) -> Int[Array, " n"]:
+        """The elements in order."""
+        return x.T.reshape(-1)[: self.n]
 
 
 def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:
@@ -44,20 +82,25 @@ def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[A
 
 
 def group_by_key(
-    keys: Int[Array, " m"], values: Int[Array, " m"], n_keys: int
+    keys: Int[Array, "r c"], values: Int[Array, "r c"], n_keys: int
 ) -> tuple[Int[Array, " m"], Int[Array, " k"], Int[Array, " k"]]:
-    """Values in stable order of their keys in 0..n_keys, and where the values of each key < n_keys start and end."""
-
-    def counting(keys, values):
-        (values,), bounds = _counting_pass(keys, n_keys + 1, [values], _KEY_COLUMNS)
-        return values, bounds[:-1], bounds[1:]
-
-    def comparing(keys, values):
-        keys, values = lax.sort((keys, values), num_keys=1, is_stable=True)
-        bounds = jnp.searchsorted(keys, jnp.arange(n_keys + 1, dtype=jnp.int32)).astype(jnp.int32)
-        return values, bounds[:-1], bounds[1:]
-
+    """Values, laid out as `Columns`, in stable order of their keys in 0..n_keys, and where the values of each key <
+    n_keys start and end."""
+    counting, comparing = (functools.partial(group, n_keys=n_keys) for group in (_group_counting, _group_lax))
     return lax.platform_dependent(keys, values, cpu=counting, default=comparing)
+
+
+def _group_counting(keys, values, n_keys):
+    places, bounds = _places(keys, n_keys + 1)
+    values = jnp.zeros(values.size, jnp.int32).at[places].set(values, unique_indices=True, mode="promise_in_bounds")
+    return values, bounds[:-1], bounds[1:]
+
+
+def _group_lax(keys, values, n_keys):
+    keys, values = (Columns(x.size, *x.shape).flat(x) for x in (keys, values))
+    keys, values = lax.sort((keys, values), num_keys=1, is_stable=True)
+    bounds = jnp.searchsorted(keys, jnp.arange(n_keys + 1, dtype=jnp.int32)).astype(jnp.int32)
+    return values, bounds[:-1], bounds[1:]
 
 
 def _depth_order_lax(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:
@@ -73,39 +116,37 @@ def _depth_order_counting(depths: Float[Array, " n"], visible: Bool[Array, " n"]
     span = greatest - least + 1
     keys = jnp.where(visible, bits - least, span)
     passes = (32 - lax.clz(span) + _DEPTH_BITS - 1) // _DEPTH_BITS
+    n = depths.shape[0]
+    layout = Columns.of(n, _DEPTH_COLUMNS)
 
     def sort_digit(i, carry):
         keys, indices = carry
-        digits = lax.shift_right_logical(keys, i * _DEPTH_BITS) & ((1 << _DEPTH_BITS) - 1)
-        (keys, indices), _ = _counting_pass(digits, 1 << _DEPTH_BITS, [keys, indices], _DEPTH_COLUMNS)
-        return keys, indices
+        laid = layout.lay(keys, 2**31 - 1)
+        digits = lax.shift_right_logical(laid, i * _DEPTH_BITS) & ((1 << _DEPTH_BITS) - 1)
+        places = layout.flat(_places(digits, 1 << _DEPTH_BITS)[0])
+        write = {"unique_indices": True, "mode": "promise_in_bounds"}
+        return keys.at[places].set(keys, **write), indices.at[places].set(indices, **write)
 
-    indices = jnp.arange(depths.shape[0], dtype=jnp.int32)
+    indices = jnp.arange(n, dtype=jnp.int32)
     return lax.fori_loop(jnp.int32(0), passes, sort_digit, (keys, indices))[1]
 
 
-def _counting_pass(
-    digits: Int[Array, " n"], n_digits: int, payloads: list[Int[Array, " n"]], columns: int
-) -> tuple[list[Int[Array, " n"]], Int[Array, " d"]]:
-    """Payloads in stable order of their digits in 0..n_digits-1, and the position where each digit starts.
+def _places(digits: Int[Array, "r c"], n_digits: int) -> tuple[Int[Array, "r c"], Int[Array, " d"]]:
+    """Places of elements, laid out as `Columns`, in stable order of their digits in 0..n_digits-1, and the place where
+    each digit starts.
 
-    The n digits are cut into independent columns with their own counters, so that a row of them is counted at once.
-    The scan is not unrolled, and reads a counter after it has written it: otherwise XLA on CPU copies the table of
-    counters in every step, which costs a factor of 25 to 1000.
+    Each column has counters of its own, so that a row is counted at once. The scan is not unrolled, and reads a counter
+    after it has written it: otherwise XLA on CPU copies the table of counters in every step, which costs a factor of 25
+    to 1000.
     """
-    n = digits.shape[0]
-    rows = -(-n // columns)
-    padded = jnp.pad(digits, (0, rows * columns - n), constant_values=n_digits - 1).reshape(columns, rows)
-    slots = padded + jnp.arange(columns, dtype=jnp.int32)[:, None] * n_digits
+    n_columns = digits.shape[1]
+    # Counters lie by digit, then by column, as places are handed out.
+    slots = digits * n_columns + jnp.arange(n_columns, dtype=jnp.int32)[None]
 
     def count_row(counters, slots):
         counters = counters.at[slots].add(1, unique_indices=True, mode="promise_in_bounds")
-        return counters, counters[slots]
+        return counters, columns.take(counters, slots)
 
-    counters, ranks = lax.scan(count_row, jnp.zeros(columns * n_digits, jnp.int32), slots.T)
-    # Counters lie by column and digit; positions are handed out by digit, then by column.
-    starts = exclusive_sum(counters.reshape(columns, n_digits).T.reshape(-1))
-    starts = starts.reshape(n_digits, columns).T.reshape(-1)
-    positions = (starts[slots] + ranks.T - 1).reshape(-1)[:n]
-    moved = [jnp.zeros_like(p).at[positions].set(p, unique_indices=True, mode="drop") for p in payloads]
-    return moved, starts[:n_digits]
+    counters, ranks = lax.scan(count_row, jnp.zeros(n_digits * n_columns, jnp.int32), slots)
+    starts = exclusive_sum(counters)
+    return columns.take(starts, slots) + ranks - 1, starts[::n_columns]

@@ -9,63 +9,64 @@ import typing
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from avatarjax.splat import sorting
+from avatarjax.splat import columns, sorting
 from avatarjax.splat.config import ALPHA_MIN
-from avatarjax.splat.project import Splats
+from avatarjax.splat.project import CHANNELS, Splats, X, Y
 
 
 @dataclasses.dataclass(frozen=True)
 class TileGrid:
-    """An image of width x height pixels cut into tiles; the last ones may hang over the edge."""
+    """An image of width x height pixels cut into tiles; the last ones may hang over the edge.
+
+    With several `shards`, the first takes tile row 0, `shards`, 2 `shards`, ... of the image, the second row 1, and so
+    on: rows of a scene that is nowhere equally dense come out about equal. `tiles` and `rows` are those of one shard.
+    """
 
     width: int
     height: int
     tile_width: int
     tile_height: int
+    shards: int = 1
 
     @property
     def columns(self) -> int:
         return -(-self.width // self.tile_width)
 
     @property
-    def rows(self) -> int:
+    def image_rows(self) -> int:
         return -(-self.height // self.tile_height)
+
+    @property
+    def rows(self) -> int:
+        return -(-self.image_rows // self.shards)
 
     @property
     def tiles(self) -> int:
         return self.columns * self.rows
 
-    @property
-    def tile_pixels(self) -> int:
-        return self.tile_width * self.tile_height
-
-    def pixel_centers(self) -> tuple[np.ndarray, np.ndarray]:
-        """x and y (tile_pixels,) of the pixel centres of a tile, relative to its corner."""
-        index = np.arange(self.tile_pixels)
-        return index % self.tile_width + 0.5, index // self.tile_width + 0.5
-
-    def corners(self, tiles: Int[Array, " l"]) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
-        """x and y of the upper left corners of tiles, pixels."""
-        x, y = (tiles % self.columns) * self.tile_width, (tiles // self.columns) * self.tile_height
-        return x.astype(jnp.float32), y.astype(jnp.float32)
+    def corners(self, shard: Int[Array, ""] | int = 0) -> Float[Array, "t 2"]:
+        """x and y of the upper left corners of all tiles of a shard, pixels."""
+        tile = jnp.arange(self.tiles, dtype=jnp.int32)
+        x = tile % self.columns * self.tile_width
+        y = (tile // self.columns * self.shards + shard) * self.tile_height
+        return jnp.stack([x, y], axis=1).astype(jnp.float32)
 
     def assemble(self, blocks: Float[Array, "t c p"]) -> Float[Array, "h w c"]:
-        """The image of per-tile blocks of c channels by tile_pixels."""
+        """The image of the blocks, c channels by pixels of a tile, of all shards one after another."""
         channels = blocks.shape[1]
-        image = blocks.reshape(self.rows, self.columns, channels, self.tile_height, self.tile_width)
-        image = image.transpose(0, 3, 1, 4, 2)
-        image = image.reshape(self.rows * self.tile_height, self.columns * self.tile_width, channels)
+        image = blocks.reshape(self.shards, self.rows, self.columns, channels, self.tile_height, self.tile_width)
+        image = image.transpose(1, 0, 4, 2, 5, 3)
+        image = image.reshape(self.rows * self.shards * self.tile_height, self.columns * self.tile_width, channels)
         return image[: self.height, : self.width]
 
 
 class TileLists(typing.NamedTuple):
     """Gaussian indices of all tiles one after another, near to far in each: tile k has ids[starts[k]:ends[k]].
 
-    ids (capacity,), starts (tiles,), ends (tiles,) int32. total: intersections of the scene, exact up to 2^24, at
-    most 2^30; dropped: how many of them did not fit into the capacity, the farthest Gaussians first.
+    ids (capacity,), starts (tiles,), ends (tiles,) int32. total: tiles in the bounding boxes of all Gaussians, exact up
+    to 2^24, at most 2^30; dropped: how many of them did not fit into the capacity, the farthest Gaussians first.
     """
 
     ids: Int[Array, " m"]
@@ -75,62 +76,67 @@ class TileLists(typing.NamedTuple):
     dropped: Int[Array, ""]
 
 
-class _Footprints(typing.NamedTuple):
+class _Boxes(typing.NamedTuple):
+    """Bounding boxes in tiles: the first tile, columns, and tiles in all."""
+
     first_tile: Int[Array, " n"]
     columns: Int[Array, " n"]
     tiles: Int[Array, " n"]
 
 
-def bin_splats(splats: Splats, grid: TileGrid, capacity: int) -> TileLists:
-    """Lists of the Gaussians that reach ALPHA_MIN within the bounding box of a tile. Not differentiable.
+def bin_splats(
+    splats: Splats, grid: TileGrid, capacity: int, shard: Int[Array, ""] | int = 0, cull: bool = False
+) -> TileLists:
+    """Lists of the Gaussians whose bounding box, or with `cull` whose ellipse, meets a tile of a shard.
 
-    Under `jax.vmap` the scenes are binned one after another.
+    Not differentiable. Under `jax.vmap` the scenes are binned one after another.
     """
-    binned = jax.custom_batching.sequential_vmap(functools.partial(_bin_splats, grid=grid, capacity=capacity))
-    return binned(jax.lax.stop_gradient(splats))
+    one_scene = functools.partial(_bin_splats, grid=grid, capacity=capacity, cull=cull)
+    binned = jax.custom_batching.sequential_vmap(one_scene)
+    return binned(jax.lax.stop_gradient(splats), jnp.int32(shard))
 
 
-def count_intersections(splats: Splats, grid: TileGrid) -> Int[Array, ""]:
-    """Number of (Gaussian, tile) intersections, exact up to 2^24, at most 2^30."""
-    tiles = _footprints(splats, grid).tiles
+def count_intersections(splats: Splats, grid: TileGrid, shard: Int[Array, ""] | int = 0) -> Int[Array, ""]:
+    """Number of tiles in the bounding boxes of all Gaussians, exact up to 2^24, at most 2^30."""
+    tiles = _boxes(splats, grid, jnp.int32(shard)).tiles
     return sorting.exclusive_sum(tiles)[-1] + tiles[-1]
 
 
-def _bin_splats(splats: Splats, *, grid: TileGrid, capacity: int) -> TileLists:
-    n = splats.depth.shape[0]
-    footprints = _footprints(splats, grid)
-    order = sorting.depth_order(splats.depth, footprints.tiles > 0)
-    sorted_footprints = jnp.stack(footprints, axis=1)[order]
-    first_tile, columns, tiles = (sorted_footprints[:, k] for k in range(3))
+def _bin_splats(splats: Splats, shard: Int[Array, ""], *, grid: TileGrid, capacity: int, cull: bool) -> TileLists:
+    n, depth = splats.table.shape[0], splats.table[:, -1]
+    boxes = _boxes(splats, grid, shard)
+    order = sorting.depth_order(depth, boxes.tiles > 0)
+    first_tile, across, tiles = columns.split(columns.take(columns.join(list(boxes)), order))
     starts = sorting.exclusive_sum(tiles)
     total = starts[-1] + tiles[-1]
-    # One list entry per intersection: mark where each Gaussian's entries start, and count marks to know whose they are.
+    # One list entry per tile of a box: mark where each Gaussian's entries start, and count marks to know whose they
+    # are.
     marks = jnp.zeros(capacity, jnp.int32).at[jnp.where(tiles > 0, starts, capacity)].add(1, mode="drop")
     owners = jnp.clip(sorting.exclusive_sum(marks) + marks - 1, 0, n - 1)
-    entry = jnp.stack([starts, first_tile, columns, order], axis=1)[owners]
-    start, first_tile, columns, ids = (entry[:, k] for k in range(4))
-    entries = jnp.arange(capacity, dtype=jnp.int32)
-    within = entries - start
+    layout = sorting.Columns.of(capacity, sorting.KEY_COLUMNS)
+    entry = columns.take(columns.join([starts, first_tile, across, order]), layout.lay(owners, 0))
+    start, first_tile, across, ids = (entry[..., k] for k in range(4))
+    within = layout.elements - start
     # Integer division is slow on CPU; the half keeps the rounding of the float quotient away from the integers.
-    row = ((within.astype(jnp.float32) + 0.5) / columns.astype(jnp.float32)).astype(jnp.int32)
-    tile = first_tile + row * grid.columns + within - row * columns
-    tile = jnp.where(entries < total, tile, grid.tiles)
+    row = ((within.astype(jnp.float32) + 0.5) / across.astype(jnp.float32)).astype(jnp.int32)
+    tile = first_tile + row * grid.columns + within - row * across
+    used = layout.elements < jnp.minimum(total, capacity)
+    if cull:
+        used &= _reached(splats.table, ids, grid.corners(shard), tile, grid)
+    tile = jnp.where(used, tile, grid.tiles)
     ids, starts, ends = sorting.group_by_key(tile, ids, grid.tiles)
     return TileLists(ids, starts, ends, total, jnp.maximum(total - capacity, 0))
 
 
-def _footprints(splats: Splats, grid: TileGrid) -> _Footprints:
-    # alpha >= ALPHA_MIN inside an ellipse of this many standard deviations, squared.
-    reach = jnp.where(splats.valid, 2 * (splats.log_opacity - math.log(ALPHA_MIN)), 0.0)
-    # Validity goes into the extents, and is read off them: XLA keeps square roots, but computes what is cheap, such as
-    # the whole projection, again for each gathered element.
-    extent_x, extent_y = (jnp.sqrt(jnp.maximum(reach, 0.0) * v) for v in (splats.variance_x, splats.variance_y))
-    x0, x1 = _tile_range(splats.x, extent_x, grid.tile_width, grid.columns)
-    y0, y1 = _tile_range(splats.y, extent_y, grid.tile_height, grid.rows)
-    return _Footprints(
+def _boxes(splats: Splats, grid: TileGrid, shard: Int[Array, ""]) -> _Boxes:
+    x0, x1 = _tile_range(splats.table[:, X], splats.extents[:, 0], grid.tile_width, grid.columns)
+    y0, y1 = _tile_range(splats.table[:, Y], splats.extents[:, 1], grid.tile_height, grid.image_rows)
+    # Of the rows of the image, one in `shards` is this shard's.
+    y0, y1 = ((y - shard + grid.shards - 1) // grid.shards for y in (y0, y1))
+    return _Boxes(
         first_tile=y0 * grid.columns + x0,
         columns=jnp.maximum(x1 - x0, 1),
-        tiles=jnp.where(extent_x > 0, (x1 - x0) * (y1 - y0), 0),
+        tiles=jnp.where(splats.extents[:, 0] > 0, (x1 - x0) * (y1 - y0), 0),
     )
 
 
@@ -141,3 +147,32 @@ def _tile_range(
     first = jnp.clip(jnp.ceil((center - extent + 0.5) / size) - 1, 0, tiles).astype(jnp.int32)
     stop = jnp.clip(jnp.floor((center + extent - 0.5) / size) + 1, 0, tiles).astype(jnp.int32)
     return first, jnp.maximum(stop, first)
+
+
+def _reached(
+    table: Float[Array, "n k"],
+    ids: Int[Array, "r c"],
+    corners: Float[Array, "t 2"],
+    tile: Int[Array, "r c"],
+    grid: TileGrid,
+) -> Bool[Array, "r c"]:
+    """Whether the ellipse within which a Gaussian counts meets the rectangle of a tile's pixel centres.
+
+    The largest value of a concave quadratic form over a rectangle is on the sides that face its centre, if that is
+    outside.
+    """
+    entry = columns.take(table[:, :CHANNELS], ids)
+    x, y, xx, xy, yy, log2_opacity = (entry[..., k] for k in range(CHANNELS))
+    corner = columns.take(corners, jnp.minimum(tile, grid.tiles - 1))
+    x0, y0 = corner[..., 0] + 0.5 - x, corner[..., 1] + 0.5 - y
+    x1, y1 = x0 + (grid.tile_width - 1), y0 + (grid.tile_height - 1)
+    side_x, side_y = jnp.clip(0.0, x0, x1), jnp.clip(0.0, y0, y1)
+    along_y = jnp.clip(-0.5 * xy * side_x / yy, y0, y1)
+    along_x = jnp.clip(-0.5 * xy * side_y / xx, x0, x1)
+
+    def logarithm(dx, dy):
+        return xx * dx * dx + xy * dx * dy + yy * dy * dy
+
+    # A little less than ALPHA_MIN, for the rounding of both.
+    nearest = jnp.maximum(logarithm(side_x, along_y), logarithm(along_x, side_y))
+    return log2_opacity + 0.999 * nearest >= math.log2(ALPHA_MIN) - 0.001
