@@ -29,7 +29,7 @@ def materialize(x: Num[Array, "n ..."]) -> Num[Array, "n ..."]:
 @jax.custom_vjp
 def join(columns: list[Num[Array, " n"]]) -> Num[Array, "n k"]:
     """The matrix of k columns."""
-    rows = jnp.zeros((columns[0].shape[0], len(columns)), columns[0].dtype)
+    rows = materialize(jnp.zeros((columns[0].shape[0], len(columns)), columns[0].dtype))
     for k, column in enumerate(columns):
         rows = lax.dynamic_update_slice(rows, column[:, None], (0, k))
     return materialize(rows)

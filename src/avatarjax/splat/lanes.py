@@ -14,16 +14,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from avatarjax.splat.config import TRANSMITTANCE_MIN
+from avatarjax.splat.tiles import TileLists
 
 _MIN_LANES = 16
-
-
-class Lists(typing.NamedTuple):
-    """Rows of a table, near to far, of all tiles one after another: tile k has ids[starts[k]:ends[k]]."""
-
-    ids: Int[Array, " m"]
-    starts: Int[Array, " t"]
-    ends: Int[Array, " t"]
 
 
 class Queue(typing.NamedTuple):
@@ -52,7 +45,7 @@ def number(most: int, tiles: int) -> int:
     return min(most, max(_MIN_LANES, tiles // 16))
 
 
-def start(lists: Lists, lanes: int) -> tuple[Queue, Work]:
+def start(lists: TileLists, lanes: int) -> tuple[Queue, Work]:
     """The queue of all tiles with a list, and the lanes at the first of them."""
     lengths = lists.ends - lists.starts
     none = lengths.shape[0]
@@ -69,7 +62,7 @@ def busy(work: Work, queue: Queue) -> Bool[Array, ""]:
     return jnp.any(work.tile < queue.none)
 
 
-def entries(work: Work, queue: Queue, lists: Lists, steps: int, blank: int) -> Int[Array, "l s"]:
+def entries(work: Work, queue: Queue, lists: TileLists, steps: int, blank: int) -> Int[Array, "l s"]:
     """The next `steps` rows of each lane; past the end of its list, the row `blank`."""
     places = work.position[:, None] + jnp.arange(steps, dtype=jnp.int32)[None]
     ids = lists.ids[jnp.minimum(places, lists.ids.shape[0] - 1)]

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from avatarjax import rotations
 from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
 from avatarjax.splat import columns
@@ -74,8 +73,13 @@ def project(
     row_y = [j_yy * r[1, i] + j_yz * r[2, i] for i in range(3)]
     # Principal axes on the image plane, scaled: the covariance is the sum of their outer products.
     axes = _rotation_columns(quats)
-    ax = [(row_x[0] * a[0] + row_x[1] * a[1] + row_x[2] * a[2]) * s for a, s in zip(axes, scales, strict=True)]
-    ay = [(row_y[0] * a[0] + row_y[1] * a[1] + row_y[2] * a[2]) * s for a, s in zip(axes, scales, strict=True)]
+    ax, ay = (
+        [
+            columns.materialize(s * (row[0] * a[0] + row[1] * a[1] + row[2] * a[2]))
+            for a, s in zip(axes, scales, strict=True)
+        ]
+        for row in (row_x, row_y)
+    )
     variance_x = ax[0] * ax[0] + ax[1] * ax[1] + ax[2] * ax[2] + config.eps2d
     variance_y = ay[0] * ay[0] + ay[1] * ay[1] + ay[2] * ay[2] + config.eps2d
     covariance = ax[0] * ay[0] + ax[1] * ay[1] + ax[2] * ay[2]
@@ -117,7 +121,9 @@ def _log_opacities(logits: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def _rotation_columns(quats: Float[Array, "n 4"]) -> list[tuple[Float[Array, " n"], ...]]:
-    w, x, y, z = columns.split(rotations.normalize(quats))
+    w, x, y, z = columns.split(quats)
+    scale = lax.rsqrt(jnp.maximum(w * w + x * x + y * y + z * z, 1e-12))
+    w, x, y, z = (scale * q for q in (w, x, y, z))
     return [
         (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),

@@ -134,7 +134,7 @@ def _draw(
     grid: tiles.TileGrid,
     capacity: int,
     config: SplatConfig,
-) -> tuple[Float[Array, "t c p"], list[Int[Array, ""]]]:
+) -> tuple[Float[Array, "t c p"], Int[Array, " 3"]]:
     """The blended tiles of a shard, which projects its part of the Gaussians; and intersections, those dropped, and the
     Gaussians that are not finite, of all shards."""
     splats, finite = project(gaussians, features, camera, config)
@@ -142,8 +142,8 @@ def _draw(
     shard = sharding.index(config.shards)
     lists = tiles.bin_splats(splats, grid, -(-capacity // config.shards), shard, config.cull_ellipses)
     blended = blend(splats.table, lists, grid.corners(shard), config)
-    counts = [lists.total, lists.dropped, jnp.sum(~finite, dtype=jnp.int32)]
-    return blended, [sharding.total(count, config.shards) for count in counts]
+    counts = jnp.stack([lists.total, lists.dropped, jnp.sum(~finite, dtype=jnp.int32)])
+    return blended, sharding.total(counts, config.shards)
 
 
 @functools.partial(jax.jit, static_argnames="config")

@@ -63,6 +63,6 @@ def index(shards: int) -> Int[Array, ""] | int:
     return 0 if shards == 1 else lax.axis_index(_AXIS)
 
 
-def total(count: Int[Array, ""], shards: int) -> Int[Array, ""]:
-    """The sum over all shards."""
-    return count if shards == 1 else lax.psum(count, _AXIS)
+def total(counts: Int[Array, " k"], shards: int) -> Int[Array, " k"]:
+    """The sums over all shards."""
+    return counts if shards == 1 else lax.psum(counts, _AXIS)

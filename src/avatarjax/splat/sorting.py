@@ -119,16 +119,12 @@ def _depth_order_counting(depths: Float[Array, " n"], visible: Bool[Array, " n"]
     n = depths.shape[0]
     layout = Columns.of(n, _DEPTH_COLUMNS)
 
-    def sort_digit(i, carry):
-        keys, indices = carry
-        laid = layout.lay(keys, 2**31 - 1)
-        digits = lax.shift_right_logical(laid, i * _DEPTH_BITS) & ((1 << _DEPTH_BITS) - 1)
-        places = layout.flat(_places(digits, 1 << _DEPTH_BITS)[0])
-        write = {"unique_indices": True, "mode": "promise_in_bounds"}
-        return keys.at[places].set(keys, **write), indices.at[places].set(indices, **write)
+    def sort_digit(i, indices):
+        digits = lax.shift_right_logical(columns.take(keys, indices), i * _DEPTH_BITS) & ((1 << _DEPTH_BITS) - 1)
+        places, _ = _places(layout.lay(digits, (1 << _DEPTH_BITS) - 1), 1 << _DEPTH_BITS)
+        return indices.at[layout.flat(places)].set(indices, unique_indices=True, mode="promise_in_bounds")
 
-    indices = jnp.arange(n, dtype=jnp.int32)
-    return lax.fori_loop(jnp.int32(0), passes, sort_digit, (keys, indices))[1]
+    return lax.fori_loop(jnp.int32(0), passes, sort_digit, jnp.arange(n, dtype=jnp.int32))
 
 
 def _places(digits: Int[Array, "r c"], n_digits: int) -> tuple[Int[Array, "r c"], Int[Array, " d"]]:
