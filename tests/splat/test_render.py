@@ -1,14 +1,19 @@
 """The renderer against its float64 reference, and what must hold for any scene."""
 
+import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+from hypothesis import strategies
+from jax.experimental import checkify
 
 from avatarjax import Camera, look_at, orbit, render, rotations
 from avatarjax.gaussians import transform
-from avatarjax.splat import SplatConfig, required_capacity
+from avatarjax.splat import SplatConfig, check, required_capacity
 from avatarjax.splat.reference import render_reference
+from benchmarks.scenes import body_camera, body_cloud
 from tests.splat.scenes import front_camera, random_gaussians
 
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
@@ -37,7 +42,7 @@ def reference_image(gaussians, camera, background=0.0):
 
 def relative_error(got, expected):
     got, expected = np.asarray(got, np.float64), np.asarray(expected, np.float64)
-    return np.linalg.norm(got - expected) / np.linalg.norm(expected)
+    return np.linalg.norm(got - expected) / max(np.linalg.norm(expected), 1e-12)
 
 
 @pytest.mark.parametrize("size", [(37, 23), (1, 1)], ids=str)
@@ -88,6 +93,110 @@ def test_gradient_of_the_camera_matches_the_reference(gradients, name):
 
 def test_gradient_of_the_background_matches_the_reference(gradients):
     assert relative_error(gradients[0][2], gradients[1][2]) < 1e-4
+
+
+def batched(shape):
+    """Clouds of one camera each in a batch of this shape, and `render` under as many `vmap`s."""
+    count = int(np.prod(shape))
+    clouds = [random_gaussians(n=20, seed=seed) for seed in range(count)]
+    cameras = orbit(np.linspace(0, 2, count), target=(0, 0, 0), distance=3.0, width=16, height=12)
+    clouds = jax.tree.map(lambda *x: jnp.stack(x).reshape(*shape, *x[0].shape), *clouds)
+    return clouds, jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), cameras)
+
+
+@pytest.mark.parametrize("channels", [3, 32])
+@pytest.mark.parametrize("shape", [(), (2,), (2, 3)], ids=str)
+def test_features_and_their_gradients_match_the_reference_in_any_batch(shape, channels):
+    rng = np.random.default_rng(0)
+    clouds, cameras = batched(shape)
+    features = jnp.asarray(rng.normal(size=(*shape, 20, channels)), jnp.float32)
+    background = jnp.asarray(rng.normal(size=channels), jnp.float32)
+    weights = jnp.asarray(rng.normal(size=(*shape, 12, 16, channels)), jnp.float32)
+
+    def energy(draw):
+        one = lambda g, c, f: draw(g, c, features=f, background=background).image  # noqa: E731
+        for _ in shape:
+            one = jax.vmap(one)
+        return jax.jit(
+            jax.value_and_grad(
+                lambda g, f: (lambda image: (jnp.sum(weights * image), image))(one(g, cameras, f)), (0, 1), has_aux=True
+            )
+        )(clouds, features)
+
+    ((_, image), gradients), ((_, expected), oracle) = energy(render), energy(render_reference)
+    np.testing.assert_allclose(image, expected, atol=1e-5)
+    for got, want in zip(jax.tree.leaves(gradients), jax.tree.leaves(oracle), strict=True):
+        assert relative_error(got, want) < 1e-4
+
+
+@pytest.mark.parametrize(
+    "config", [SplatConfig(antialiased=True), SplatConfig(cull_ellipses=True)], ids=["mip", "cull"]
+)
+def test_options_match_the_reference_with_gradients(config):
+    gaussians, camera = random_gaussians(size=0.02), front_camera(37, 23)
+
+    def energy(draw):
+        loss = lambda g, c: jnp.sum(draw(g, c, config=config).image ** 2)  # noqa: E731
+        return jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
+
+    got, gradients = energy(render)(gaussians, camera)
+    with jax.enable_x64(True):
+        expected, oracle = jax.tree.map(np.asarray, energy(render_reference)(*to_float64((gaussians, camera))))
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
+    for x, y in zip(jax.tree.leaves(gradients), jax.tree.leaves(oracle), strict=True):
+        assert relative_error(x, y) < 1e-4
+
+
+def test_antialiasing_keeps_the_light_of_a_small_gaussian():
+    gaussian = random_gaussians(n=1, size=0.01, spread=0.0).replace(logit_opacities=jnp.asarray([3.0]))
+    near, far = (front_camera(32, 32, eye=(0.0, 0.0, distance)) for distance in (1.0, 2.0))
+
+    def light(camera, antialiased):
+        return float(jnp.sum(render(gaussian, camera, config=SplatConfig(antialiased=antialiased)).alpha))
+
+    # Twice as far away, a quarter of the area; without the correction the blur keeps it as large as before.
+    assert 3.5 < light(near, True) / light(far, True) < 4.5
+    assert light(near, False) / light(far, False) < 2
+
+
+def body_scene():
+    """Part of a body-like cloud, opaque and several layers deep, small enough for a float64 reference."""
+    cloud, camera = body_cloud(1500), body_camera(40)
+    logits = np.random.default_rng(1).normal(size=1500).astype(np.float32)
+    return cloud.replace(logit_opacities=jnp.asarray(logits)), camera
+
+
+def test_body_like_scene_matches_the_reference_with_gradients():
+    gaussians, camera = body_scene()
+    inputs = (gaussians, camera, jnp.asarray(BACKGROUND))
+    output = render(gaussians, camera, background=BACKGROUND)
+    expected = reference_image(gaussians, camera, BACKGROUND)
+    np.testing.assert_allclose(output.image, expected.image, atol=1e-5)
+    got = jax.jit(jax.grad(weighted_sum(render), argnums=(0, 1, 2)))(*inputs)
+    with jax.enable_x64(True):
+        oracle = jax.jit(jax.grad(weighted_sum(render_reference), argnums=(0, 1, 2)))(*to_float64(inputs))
+        oracle = jax.tree.map(np.asarray, oracle)
+    jax.tree.map(lambda g, o: np.testing.assert_array_less(relative_error(g, o), 1e-4), got, oracle)
+
+
+def test_gradient_descent_recovers_a_perturbed_scene():
+    truth, _ = small_scene()
+    cameras = orbit([0.0, 1.5, 3.0], target=(0, 0, 0), distance=3.0, width=16, height=12)
+    draw = jax.vmap(lambda cloud, camera: render(cloud, camera).image, (None, 0))
+    target = draw(truth, cameras)
+    rng = np.random.default_rng(3)
+    start = jax.tree.map(lambda x: x + jnp.asarray(0.05 * rng.normal(size=x.shape), jnp.float32), truth)
+    optimiser = optax.adam(5e-3)
+    loss = lambda cloud: jnp.mean((draw(cloud, cameras) - target) ** 2)  # noqa: E731
+
+    @jax.jit
+    def step(_, carry):
+        cloud, state = carry
+        updates, state = optimiser.update(jax.grad(loss)(cloud), state)
+        return optax.apply_updates(cloud, updates), state
+
+    fitted, _ = jax.lax.fori_loop(0, 150, step, (start, optimiser.init(start)))
+    assert float(loss(fitted)) < 0.02 * float(loss(start))
 
 
 def test_opaque_clouds_lose_at_most_the_light_of_the_early_stop():
@@ -159,6 +268,65 @@ def test_gradient_of_many_views_is_the_sum_of_their_gradients():
     views = [jax.tree.map(lambda x, k=k: x[k], cameras) for k in range(2)]
     expected = sum(energy_gradients(gaussians, view)[0].means for view in views)
     np.testing.assert_allclose(jax.jit(jax.grad(loss))(gaussians).means, expected, atol=1e-4)
+
+
+def test_gaussians_at_one_depth_are_blended_in_their_order():
+    gaussians = random_gaussians(n=2, spread=0.0, size=0.3).replace(
+        logit_opacities=jnp.full(2, 8.0), colors=jnp.asarray([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    )
+    pixel = render(gaussians, front_camera(15, 15)).image[7, 7]
+    assert pixel[0] > 0.9 > 0.1 > pixel[1]
+
+
+def test_one_gaussian_over_the_whole_image_reaches_every_pixel():
+    gaussian = random_gaussians(n=1, size=50.0, spread=0.0).replace(logit_opacities=jnp.asarray([2.0]))
+    output = render(gaussian, front_camera(19, 13))
+    np.testing.assert_allclose(output.alpha, jax.nn.sigmoid(2.0), atol=1e-3)
+    assert int(output.info.total) == 3 * 4
+
+
+@hypothesis.settings(max_examples=25, deadline=None, derandomize=True)
+@hypothesis.given(
+    seed=strategies.integers(0, 10_000), size=strategies.floats(1e-4, 30.0), spread=strategies.floats(0, 9)
+)
+def test_alpha_is_between_zero_and_one_and_nothing_is_infinite(seed, size, spread):
+    _, camera = small_scene()
+    output = render(random_gaussians(n=20, seed=seed, size=size, spread=spread), camera)
+    assert np.all(output.alpha >= 0) and np.all(output.alpha <= 1)
+    assert np.all(np.isfinite(output.image)) and np.all(np.isfinite(output.depth))
+
+
+@pytest.mark.parametrize("fits", [True, False])
+def test_check_raises_what_does_not_fit_under_checkify(fits):
+    gaussians, camera = random_gaussians(n=20, size=0.3), front_camera(16, 12)
+    config = SplatConfig(capacity=required_capacity(gaussians, camera) if fits else 50)
+
+    def draw(gaussians):
+        output = render(gaussians, camera, config=config)
+        check(output.info)
+        return output.image
+
+    error, _ = jax.jit(checkify.checkify(draw))(gaussians)
+    assert (error.get() is None) if fits else ("did not fit" in error.get())
+
+
+def test_check_raises_gaussians_that_are_not_finite():
+    gaussians, camera = small_scene()
+    info = render(gaussians.replace(means=gaussians.means.at[3].set(jnp.nan)), camera).info
+    with pytest.raises(checkify.JaxRuntimeError, match="1 Gaussians are not finite"):
+        check(info)
+
+
+@pytest.mark.parametrize("derivative", ["forward", "second"])
+def test_derivatives_that_do_not_exist_are_refused(derivative):
+    gaussians, camera = small_scene()
+    loss = lambda g: jnp.sum(render(g, camera).image ** 2)  # noqa: E731
+    if derivative == "forward":
+        with pytest.raises(TypeError, match="forward-mode"):
+            jax.jvp(loss, (gaussians,), (gaussians,))
+    else:
+        with pytest.raises(TypeError, match="first derivatives only"):
+            jax.grad(lambda g: jnp.sum(jax.grad(loss)(g).means))(gaussians)
 
 
 def test_overflow_is_counted_and_drops_the_farthest():
@@ -250,6 +418,7 @@ def test_scalar_background_is_grey():
         ({"quats": jnp.zeros((5, 3))}, r"gaussians\.quats must have shape \(5, 4\)"),
         ({"means": jnp.zeros((2, 5, 3))}, r"use jax\.vmap"),
         ({"colors": jnp.zeros((5, 3), jnp.bfloat16)}, "must be float32"),
+        ({"sh": jnp.zeros((4, 3, 3))}, r"gaussians\.sh must have shape \(5, 3, 3\)"),
     ],
 )
 def test_wrong_clouds_are_refused_by_name(change, message):
@@ -265,6 +434,8 @@ def test_wrong_cameras_and_backgrounds_are_refused():
         render(gaussians, Camera(jnp.eye(4), jnp.eye(3), 0, 8))
     with pytest.raises(ValueError, match="background"):
         render(gaussians, front_camera(8, 8), background=jnp.zeros(4))
+    with pytest.raises(ValueError, match="features"):
+        render(gaussians, front_camera(8, 8), features=jnp.zeros((4, 7)))
 
 
 @pytest.mark.parametrize("change", [{"capacity": 0}, {"near": 0.0}, {"eps2d": 0.0}, {"tile_width": 0}], ids=str)

@@ -41,15 +41,16 @@ def _blend_fwd(table, lists, corners, config):
     # A last row that is transparent, for lanes past the end of their list.
     blank = jnp.zeros((1, table.shape[1]), jnp.float32).at[0, LOG2_OPACITY].set(-1e9)
     table = _first_order(jnp.concatenate([table, blank]))
-    forward = jax.custom_batching.sequential_vmap(functools.partial(_forward, config=config))
-    blended = forward(table, lists, corners)
+    forward = lanes.by_platform(functools.partial(_forward, config=config), config.forward_lanes, corners.shape[0])
+    blended = jax.custom_batching.sequential_vmap(forward)(table, lists, corners)
     return blended, (table, lists, corners, blended)
 
 
 def _blend_bwd(config, residuals, cotangent):
     table, lists, corners, blended = residuals
     cotangent = _first_order(cotangent)
-    backward = jax.custom_batching.sequential_vmap(functools.partial(_backward, config=config))
+    backward = lanes.by_platform(functools.partial(_backward, config=config), config.backward_lanes, corners.shape[0])
+    backward = jax.custom_batching.sequential_vmap(backward)
     return backward(table, lists, corners, blended, cotangent)[:-1], None, None
 
 
@@ -84,9 +85,10 @@ def _forward(
     corners: Float[Array, "t 2"],
     *,
     config: SplatConfig,
+    n_lanes: int,
 ) -> Float[Array, "t c p"]:
     n_tiles, n_channels = corners.shape[0], table.shape[1] - CHANNELS
-    n_lanes, steps = lanes.number(config.forward_lanes, n_tiles), config.forward_steps
+    steps = config.forward_steps
     pixels = jnp.asarray(_pixels(config), jnp.float32)
     queue, work = lanes.start(lists, n_lanes)
     corners = jnp.pad(corners, ((0, 1), (0, 0)))
@@ -156,10 +158,10 @@ def _backward(
     cotangent: Float[Array, "t c p"],
     *,
     config: SplatConfig,
+    n_lanes: int,
 ) -> Float[Array, "n k"]:
     """Gradient of the table. What matters of the channels is their product with the cotangent, one number a pixel."""
-    n_tiles, n_channels = corners.shape[0], table.shape[1] - CHANNELS
-    n_lanes, steps = lanes.number(config.backward_lanes, n_tiles), config.backward_steps
+    n_channels, steps = table.shape[1] - CHANNELS, config.backward_steps
     pixels, monomials = jnp.asarray(_pixels(config), jnp.float32), _monomials(config)
     center = jnp.asarray([config.tile_width / 2, config.tile_height / 2], jnp.float32)
     queue, work = lanes.start(lists, n_lanes)

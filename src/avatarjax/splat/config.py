@@ -28,9 +28,9 @@ class SplatConfig:
     cull_ellipses: leave out tiles in the corners of bounding boxes that the ellipses do not reach. Changes no picture;
     pays for long, thin Gaussians, and costs a few percent where they are round.
     shards: devices that share an image, row of tiles by row of tiles; on CPU, start with `jax_num_cpu_devices` set.
-    tile_width, tile_height: pixels. forward_lanes, backward_lanes: tiles in flight at once (small images take fewer).
-    forward_steps, backward_steps: list entries that a lane blends per iteration. The defaults are the fastest that
-    were measured on two CPU cores.
+    tile_width, tile_height: pixels. forward_lanes, backward_lanes: tiles in flight at once; None takes up to 128 on CPU
+    and up to 4096 elsewhere. forward_steps, backward_steps: list entries that a lane blends per iteration. The defaults
+    are the fastest that were measured on two CPU cores.
     """
 
     capacity: int | None = None
@@ -41,23 +41,17 @@ class SplatConfig:
     shards: int = 1
     tile_width: int = 8
     tile_height: int = 4
-    forward_lanes: int = 128
+    forward_lanes: int | None = None
     forward_steps: int = 16
-    backward_lanes: int = 128
+    backward_lanes: int | None = None
     backward_steps: int = 8
 
     def __post_init__(self) -> None:
         if self.capacity is not None and not 0 < self.capacity <= CAPACITY_MAX:
             raise ValueError(f"capacity must be in 1..{CAPACITY_MAX} or None, got {self.capacity}")
-        for name in (
-            "shards",
-            "tile_width",
-            "tile_height",
-            "forward_lanes",
-            "forward_steps",
-            "backward_lanes",
-            "backward_steps",
-        ):
+        counts = ["shards", "tile_width", "tile_height", "forward_steps", "backward_steps"]
+        counts += [name for name in ("forward_lanes", "backward_lanes") if getattr(self, name) is not None]
+        for name in counts:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.near <= 0 or self.eps2d <= 0:

@@ -7,7 +7,9 @@ length by a factor of a hundred.
 
 from __future__ import annotations
 
+import functools
 import typing
+from collections.abc import Callable
 
 import jax.numpy as jnp
 from jax import lax
@@ -16,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from avatarjax.splat.config import TRANSMITTANCE_MIN
 from avatarjax.splat.tiles import TileLists
 
-_MIN_LANES = 16
+_CPU_LANES, _MIN_LANES, _WIDE_LANES = 128, 16, 4096
 
 
 class Queue(typing.NamedTuple):
@@ -40,9 +42,17 @@ class Work(typing.NamedTuple):
     taken: Int[Array, ""]
 
 
-def number(most: int, tiles: int) -> int:
-    """Fewer lanes for small images, or the last ones idle while the longest lists end."""
-    return min(most, max(_MIN_LANES, tiles // 16))
+def by_platform(kernel: Callable, chosen: int | None, tiles: int) -> Callable:
+    """`kernel(..., n_lanes=...)` with the chosen number of lanes, or with that which suits the platform.
+
+    On CPU the lanes fit the cache, and small images take fewer, or the last ones idle while the longest lists end;
+    elsewhere all tiles are worked on at once, for the sake of few, wide operations.
+    """
+    if chosen is not None:
+        return functools.partial(kernel, n_lanes=chosen)
+    few = functools.partial(kernel, n_lanes=min(_CPU_LANES, max(_MIN_LANES, tiles // 16)))
+    many = functools.partial(kernel, n_lanes=min(_WIDE_LANES, tiles))
+    return lambda *arrays: lax.platform_dependent(*arrays, cpu=few, default=many)
 
 
 def start(lists: TileLists, lanes: int) -> tuple[Queue, Work]:

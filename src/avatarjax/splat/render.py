@@ -9,6 +9,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import checkify
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
@@ -71,12 +72,27 @@ def render(
     _check(gaussians, camera)
     if features is None:
         features = gaussians.colors if gaussians.sh is None else view_colors(gaussians, camera)
-    _check_array("features", features, (len(gaussians), features.shape[-1] if features.ndim else None))
-    channels = features.shape[1]
+    channels = features.shape[-1] if features.ndim == 2 else 1
+    _check_array("features", features, (len(gaussians), channels))
     background = jnp.asarray(background, jnp.float32)
     if background.shape not in ((), (channels,)):
         raise ValueError(f"background must be a scalar or have shape ({channels},), got {background.shape}")
     return _render(gaussians, features, camera, jnp.broadcast_to(background, (channels,)), config)
+
+
+def check(info: RenderInfo) -> None:
+    """Raise, under `jax.experimental.checkify`, where Gaussians were dropped or were not finite.
+
+    Call it on `RenderOutput.info` in a function that `checkify.checkify` wraps, jitted or not; elsewhere it raises
+    at once, or, inside `jax.jit`, that the check was not wrapped.
+    """
+    checkify.check(
+        jnp.all(info.dropped == 0),
+        "{dropped} of {total} intersections of Gaussians and tiles did not fit: see avatarjax.splat.required_capacity",
+        dropped=jnp.sum(info.dropped),
+        total=jnp.sum(info.total),
+    )
+    checkify.check(jnp.all(info.non_finite == 0), "{count} Gaussians are not finite", count=jnp.sum(info.non_finite))
 
 
 def required_capacity(
@@ -84,9 +100,9 @@ def required_capacity(
     camera: Camera,
     config: SplatConfig = SplatConfig(),
 ) -> int:
-    """A capacity with room for this cloud in this camera, or in all of a batch of cameras, and a quarter to spare.
+    """A capacity with room for this cloud in this camera, or in all of a batch of cameras, and an eighth to spare.
 
-    Rounded up to one of four steps per octave, so that similar scenes share a compiled program. Not for use under jit.
+    Rounded up to one of eight steps per octave, so that similar scenes share a compiled program. Not for use under jit.
     Raises ValueError where no capacity is enough.
     """
     views = jax.tree.map(lambda x: x.reshape(-1, *x.shape[-2:]), camera)
@@ -96,8 +112,8 @@ def required_capacity(
         raise ValueError(
             f"{total} intersections are more than {CAPACITY_MAX}: use fewer or smaller Gaussians, or tiles"
         )
-    step = 2 ** max(0, int(np.floor(np.log2(max(total, 1)))) - 2)
-    return min(CAPACITY_MAX, max(64, -(-(total + total // 4) // step) * step))
+    step = 2 ** max(0, int(np.floor(np.log2(max(total, 1)))) - 3)
+    return min(CAPACITY_MAX, max(64, -(-(total + total // 8) // step) * step))
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -179,6 +195,8 @@ def _check(gaussians: Gaussians, camera: Camera) -> None:
         "logit_opacities": (n,),
         "colors": (n, 3),
     }
+    if gaussians.sh is not None:
+        fields["sh"] = (n, gaussians.sh.shape[1] if gaussians.sh.ndim == 3 else None, 3)
     for name, shape in fields.items():
         _check_array(f"gaussians.{name}", getattr(gaussians, name), shape)
     _check_array("camera.world_to_camera", camera.world_to_camera, (4, 4))
