@@ -80,9 +80,8 @@ def _surface(
     rng: np.random.Generator, n: int, start: tuple, end: tuple, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) spread evenly over a capsule, metres, and unit normals (n, 3)."""
-    start, end = np.array(start), np.array(end)
-    length = np.linalg.norm(end - start)
-    axis = (end - start) / length
+    length = math.dist(start, end)
+    axis = np.subtract(end, start) / length
     on_side = rng.random(n) < length / (length + 2 * radius)
     directions = rng.normal(size=(n, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
