@@ -1,6 +1,6 @@
 """Speed of the splatting kernel on a CPU, beside the old prototype, the naive renderer, and two peers, in one run.
 
-    python -m benchmarks.splat              # the four scenes, all contenders that are installed
+    python -m benchmarks.splat              # bodies of four sizes and needles, all contenders that are installed
     python -m benchmarks.splat --size 2 3   # those with goals: 65k Gaussians at 256x256, 200k at 512x512
     python -m benchmarks.splat --quick      # the two small scenes, few runs: does it work?
 
@@ -87,18 +87,19 @@ def main(size: tuple[int, ...] = (), runs: int = 25, peers: bool = True, quick: 
     """Print the tables.
 
     Args:
-        size: which of the four scenes, 0 to 3; by default all, and the needles.
+        size: which scenes: 0 to 3 are bodies by size, 4 are the needles; by default all.
         runs: of each pass of each contender, in five turns; fewer of those that take longer than half a second.
         peers: measure Mitsuba and PyTorch too, if they are installed.
         quick: only the two small scenes, five runs.
     """
     runs = 5 if quick else runs
-    sizes = size or ((0, 1) if quick else (0, 1, 2, 3))
-    tables = [(Scene("body", *SIZES[k]), BODY_ENTRIES + (PEERS if peers else ())) for k in sizes]
-    if not size and not quick:
-        tables.append((_NEEDLE_SCENE, NEEDLE_ENTRIES))
+    tables = [(Scene("body", *size), BODY_ENTRIES + (PEERS if peers else ())) for size in SIZES]
+    tables.append((_NEEDLE_SCENE, NEEDLE_ENTRIES))
+    if not set(size) <= set(range(len(tables))):
+        raise SystemExit(f"--size takes numbers from 0 to {len(tables) - 1}, got {size}")
+    chosen = size or (range(2) if quick else range(len(tables)))
     differences: dict[tuple, dict[str, float]] = {}
-    for scene, entries in tables:
+    for scene, entries in (tables[k] for k in chosen):
         smallest = Scene(scene.cloud, *SIZES[0])
         if entries not in differences:
             differences[entries] = picture_differences(smallest, entries)

@@ -36,7 +36,7 @@ class Renderer:
         return render(*self._trained, *self._camera, self._size)[0]
 
     def gradient(self, weights: np.ndarray) -> tuple[torch.Tensor, ...]:
-        """Gradient of sum(image * weights) + sum(alpha), weights (h, w, 3), by means, log scales, quats, logits, colours."""
+        """Gradient of sum(image * weights) + sum(alpha) by the five arrays of the cloud; weights (h, w, 3)."""
         image, alpha = render(*self._trained, *self._camera, self._size)
         return torch.autograd.grad((image * torch.from_numpy(weights)).sum() + alpha.sum(), self._trained)
 
