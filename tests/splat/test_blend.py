@@ -14,8 +14,8 @@ from tests.splat.scenes import front_camera, random_gaussians
 
 def blended_image(gaussians, camera, config):
     grid = TileGrid(camera.width, camera.height, config.tile_width, config.tile_height)
-    splats, _ = project(gaussians, gaussians.colors, camera, config)
-    return grid.assemble(blend(splats.table, bin_splats(splats, grid, 20_000), grid.corners(), config))
+    table, _ = project(gaussians, gaussians.colors, camera, config)
+    return grid.assemble(blend(table, bin_splats(table, grid, 20_000), grid.corners(), config))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from avatarjax.splat import SplatConfig, harmonics
-from avatarjax.splat.project import LOG2_OPACITY, XX, XY, YY, X, Y, project
+from avatarjax.splat.project import DEPTH, EXTENT_X, LOG2_OPACITY, XX, XY, YY, X, Y, project
 from tests.splat.scenes import front_camera, random_gaussians
 
 torch = pytest.importorskip("torch")
@@ -22,7 +22,7 @@ def to_torch(x):
 @pytest.mark.parametrize("eye", [(0.3, 0.4, 3.0), (0.1, 0.0, 0.6)], ids=["outside", "inside"])
 def test_projection_is_that_of_gsplat(eye):
     gaussians, camera = random_gaussians(n=200), front_camera(60, 44, eye=eye)
-    splats, finite = project(gaussians, gaussians.colors, camera, SplatConfig(antialiased=True))
+    table, finite = project(gaussians, gaussians.colors, camera, SplatConfig(antialiased=True))
     sharp, _ = project(gaussians, gaussians.colors, camera, SplatConfig())
     quats = to_torch(gaussians.quats / jnp.linalg.norm(gaussians.quats, axis=1, keepdims=True))
     covariances, _ = gsplat._quat_scale_to_covar_preci(quats, to_torch(gaussians.scales), compute_preci=False)
@@ -36,14 +36,14 @@ def test_projection_is_that_of_gsplat(eye):
         calc_compensations=True,
     )
     means, depths, conics, compensations = (x[0].numpy() for x in (means, depths, conics, compensations))
-    shown = np.asarray(splats.extents[:, 0] > 0) & (depths > 0.01)
+    shown = np.asarray(table[:, EXTENT_X] > 0) & (depths > 0.01)
     assert finite.all() and shown.sum() > 50
-    table = np.asarray(splats.table)[shown]
+    table = np.asarray(table)[shown]
     np.testing.assert_allclose(table[:, [X, Y]], means[shown], rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(table[:, -1], depths[shown], rtol=1e-4)
+    np.testing.assert_allclose(table[:, DEPTH], depths[shown], rtol=1e-4)
     ours = table[:, [XX, XY, YY]] / (-math.log2(math.e) * np.array([0.5, 1.0, 0.5]))
     np.testing.assert_allclose(ours, conics[shown], rtol=1e-4, atol=1e-4 * np.abs(conics[shown]).max())
-    ratio = np.exp2(table[:, LOG2_OPACITY] - np.asarray(sharp.table)[shown, LOG2_OPACITY])
+    ratio = np.exp2(table[:, LOG2_OPACITY] - np.asarray(sharp)[shown, LOG2_OPACITY])
     np.testing.assert_allclose(ratio, compensations[shown], rtol=1e-3, atol=1e-4)
 
 

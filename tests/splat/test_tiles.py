@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avatarjax.splat import SplatConfig
-from avatarjax.splat.project import LOG2_OPACITY, XX, XY, YY, X, Y, project
+from avatarjax.splat.project import DEPTH, EXTENT_X, LOG2_OPACITY, XX, XY, YY, X, Y, project
 from avatarjax.splat.tiles import TileGrid, bin_splats, count_intersections
 from tests.splat.scenes import front_camera, random_gaussians
 
@@ -23,48 +23,48 @@ def scene():
 def lists_of(shards=1, shard=0, cull=False):
     gaussians, camera = scene()
     grid = TileGrid(camera.width, camera.height, 8, 4, shards)
-    splats, _ = project(gaussians, gaussians.colors, camera, SplatConfig())
-    lists = jax.jit(lambda s: bin_splats(s, grid, CAPACITY, shard, cull))(splats)
+    table, _ = project(gaussians, gaussians.colors, camera, SplatConfig())
+    lists = jax.jit(lambda x: bin_splats(x, grid, CAPACITY, shard, cull))(table)
     ids, starts, ends = (np.asarray(x) for x in lists[:3])
-    return splats, grid, lists, [ids[a:b].tolist() for a, b in zip(starts, ends, strict=True)]
+    return table, grid, lists, [ids[a:b].tolist() for a, b in zip(starts, ends, strict=True)]
 
 
-def visible_in(splats, grid, shards=1, shard=0):
+def visible_in(table, grid, shards=1, shard=0):
     """Sets of the Gaussians that reach ALPHA_MIN at a pixel centre of each tile, in float64."""
-    table = np.asarray(splats.table, np.float64)
+    table = np.asarray(table, np.float64)
     sets = []
     for corner in np.asarray(grid.corners(shard), np.float64):
         x, y = np.meshgrid(corner[0] + np.arange(8) + 0.5, corner[1] + np.arange(4) + 0.5)
         inside = (x < grid.width) & (y < grid.height)
         dx, dy = (p.reshape(1, -1) - table[:, [k]] for p, k in ((x, X), (y, Y)))
         log2 = table[:, [XX]] * dx**2 + table[:, [XY]] * dx * dy + table[:, [YY]] * dy**2 + table[:, [LOG2_OPACITY]]
-        hit = (log2 >= np.log2(1 / 255)) & inside.reshape(1, -1) & (np.asarray(splats.extents)[:, :1] > 0)
+        hit = (log2 >= np.log2(1 / 255)) & inside.reshape(1, -1) & (table[:, [EXTENT_X]] > 0)
         sets.append(set(np.flatnonzero(hit.any(axis=1))))
     return sets
 
 
 @pytest.mark.parametrize("cull", [False, True])
 def test_every_gaussian_is_in_the_list_of_every_tile_it_shows_in(cull):
-    splats, grid, _, lists = lists_of(cull=cull)
-    assert all(seen <= set(ids) for seen, ids in zip(visible_in(splats, grid), lists, strict=True))
+    table, grid, _, lists = lists_of(cull=cull)
+    assert all(seen <= set(ids) for seen, ids in zip(visible_in(table, grid), lists, strict=True))
 
 
 def test_culling_of_ellipses_leaves_little_that_does_not_show():
-    splats, grid, _, boxes = lists_of()
+    table, grid, _, boxes = lists_of()
     _, _, _, culled = lists_of(cull=True)
-    count = [sum(map(len, lists)) for lists in (visible_in(splats, grid), culled, boxes)]
+    count = [sum(map(len, lists)) for lists in (visible_in(table, grid), culled, boxes)]
     assert count[0] <= count[1] < 1.15 * count[0] < count[2]
 
 
 def test_lists_are_sorted_by_depth():
-    splats, _, _, lists = lists_of()
-    depth = np.asarray(splats.table[:, -1])
+    table, _, _, lists = lists_of()
+    depth = np.asarray(table[:, DEPTH])
     assert all(np.all(np.diff(depth[ids]) >= 0) for ids in lists)
 
 
 def test_total_is_the_number_of_entries():
-    splats, grid, lists, entries = lists_of()
-    assert int(lists.total) == int(count_intersections(splats, grid)) == sum(map(len, entries))
+    table, grid, lists, entries = lists_of()
+    assert int(lists.total) == int(count_intersections(table, grid)) == sum(map(len, entries))
 
 
 def test_shards_take_the_rows_of_the_image_in_turn():

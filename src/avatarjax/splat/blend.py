@@ -17,9 +17,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from avatarjax.splat import lanes
+from avatarjax.splat import columns, lanes
 from avatarjax.splat.config import ALPHA_MAX, ALPHA_MIN, SplatConfig
-from avatarjax.splat.project import CHANNELS, LOG2_OPACITY, XX, XY, YY, X, Y
+from avatarjax.splat.project import CHANNELS, EXTENT_X, LOG2_OPACITY, XX, XY, YY, X, Y
 from avatarjax.splat.tiles import TileLists
 
 
@@ -27,9 +27,9 @@ from avatarjax.splat.tiles import TileLists
 def blend(
     table: Float[Array, "n k"], lists: TileLists, corners: Float[Array, "t 2"], config: SplatConfig
 ) -> Float[Array, "t c p"]:
-    """Blend the channels of a `Splats.table` over every tile; the last of the c results is the transmittance.
+    """Blend the channels of projected Gaussians over every tile; the last of the c results is the transmittance.
 
-    `corners` are the upper left corners of the tiles, pixels. Differentiable with respect to the table. An entry counts
+    `table` as `project` makes it. `corners` are the upper left corners of the tiles, pixels. Differentiable with respect to the table. An entry counts
     from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is finished once no pixel of it lets more than TRANSMITTANCE_MIN
     through. Under `jax.vmap` the scenes are blended one after another: on two CPU cores that is as fast as letting the
     tiles of all scenes share the lanes.
@@ -38,9 +38,9 @@ def blend(
 
 
 def _blend_fwd(table, lists, corners, config):
-    # A last row that is transparent, for lanes past the end of their list.
+    # Without the extents, and with a last row that is transparent, for lanes past the end of their list.
     blank = jnp.zeros((1, table.shape[1]), jnp.float32).at[0, LOG2_OPACITY].set(-1e9)
-    table = _first_order(jnp.concatenate([table, blank]))
+    table = _first_order(jnp.concatenate([table, blank])[:, :EXTENT_X])
     forward = lanes.by_platform(functools.partial(_forward, config=config), config.forward_lanes, corners.shape[0])
     blended = jax.custom_batching.sequential_vmap(forward)(table, lists, corners)
     return blended, (table, lists, corners, blended)
@@ -51,7 +51,8 @@ def _blend_bwd(config, residuals, cotangent):
     cotangent = _first_order(cotangent)
     backward = lanes.by_platform(functools.partial(_backward, config=config), config.backward_lanes, corners.shape[0])
     backward = jax.custom_batching.sequential_vmap(backward)
-    return backward(table, lists, corners, blended, cotangent)[:-1], None, None
+    gradient = backward(table, lists, corners, blended, cotangent)
+    return jnp.pad(gradient[:-1], ((0, 0), (0, -EXTENT_X))), None, None
 
 
 blend.defvjp(_blend_fwd, _blend_bwd)
@@ -97,7 +98,7 @@ def _forward(
 
     def iterate(s: _Forward) -> _Forward:
         chosen = lanes.entries(s.work, queue, lists, steps, table.shape[0] - 1)
-        rows = lanes.in_place(s.rows, table.at[chosen].get(mode="promise_in_bounds"), s.work)
+        rows = lanes.in_place(s.rows, columns.take(table, chosen), s.work)
         alphas = lanes.in_place(s.alphas, _alphas(rows[:-1], pixels, corners[s.work.tile]), s.work)
         # Horner's scheme over the entries, back to front: one product less per entry than summing up weights.
         mixed = jnp.zeros_like(s.channels)
@@ -173,7 +174,7 @@ def _backward(
     def iterate(s: _Backward) -> _Backward:
         chosen = lanes.entries(s.work, queue, lists, steps, table.shape[0] - 1)
         corner = corners[s.work.tile]
-        rows = lanes.in_place(s.rows, table.at[chosen].get(mode="promise_in_bounds"), s.work)
+        rows = lanes.in_place(s.rows, columns.take(table, chosen), s.work)
         entry = rows[:-1]
         v = lanes.in_place(s.weights, weights[s.work.tile], s.work)
         alphas = lanes.in_place(s.alphas, _alphas(entry, pixels, corner), s.work)

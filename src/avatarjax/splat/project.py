@@ -6,7 +6,6 @@ Everything is written per component: XLA on CPU is slow at batches of 3x3 produc
 from __future__ import annotations
 
 import math
-import typing
 
 import jax.numpy as jnp
 from jax import lax
@@ -21,29 +20,21 @@ from avatarjax.splat.config import ALPHA_MIN, SplatConfig
 _VARIANCE_MAX = 1e15
 _LOG2_E = math.log2(math.e)
 
-
-# Columns of `Splats.table`. From CHANNELS on come the features, then the depth.
+# Columns of the table of projected Gaussians, one row each, which the blending reads at once.
+# X, Y: centre in pixels. XX, XY, YY, LOG2_OPACITY: the base-2 logarithm of alpha at (dx, dy) pixels from the centre is
+# XX dx^2 + XY dx dy + YY dy^2 + LOG2_OPACITY. From CHANNELS on: the features, then at DEPTH metres along the optical
+# axis. EXTENT_X, EXTENT_Y: half the sides, in pixels, of the bounding box of the ellipse in which alpha is at least
+# ALPHA_MIN; not differentiable.
 X, Y, XX, XY, YY, LOG2_OPACITY, CHANNELS = range(7)
-
-
-class Splats(typing.NamedTuple):
-    """n projected Gaussians; those that are not drawn have finite values without meaning and no extent.
-
-    table: a row each, which the blending reads at once. Centre in pixels; the base-2 logarithm of alpha at (dx, dy)
-    pixels from it as XX dx^2 + XY dx dy + YY dy^2 + LOG2_OPACITY; the features; the depth, metres along the optical
-    axis.
-    extents: half the sides, in pixels, of the bounding box of the ellipse in which alpha is at least ALPHA_MIN; not
-    differentiable.
-    """
-
-    table: Float[Array, "n k"]
-    extents: Float[Array, "n 2"]
+DEPTH, EXTENT_X, EXTENT_Y = -3, -2, -1
 
 
 def project(
     gaussians: Gaussians, features: Float[Array, "n d"], camera: Camera, config: SplatConfig
-) -> tuple[Splats, Bool[Array, " n"]]:
-    """Project a cloud of n Gaussians into one camera, and tell which of them are free of NaN, infinity and overflow.
+) -> tuple[Float[Array, "n k"], Bool[Array, " n"]]:
+    """The table of n Gaussians as one camera sees them, and which of them are free of NaN, infinity and overflow.
+
+    Those that are not drawn have no extent, and finite values without meaning.
 
     The perspective is linearised at each centre, which is first moved to within 1.3 times the field of view: farther
     out the linearisation would spread a Gaussian over the whole image (Kerbl et al. 2023, and gsplat).
@@ -101,8 +92,8 @@ def project(
     logarithms = [_LOG2_E * c for c in (*conic, log_opacity)]
     extents = [jnp.sqrt(reach * lax.stop_gradient(v)) for v in (variance_x, variance_y)]
     channels = [jnp.where(finite, f, 0.0) for f in columns.split(features)]
-    table = columns.join([*center, *logarithms, *channels, depth])
-    return Splats(table, columns.join(extents)), finite & (bounded | ~in_front)
+    table = columns.join([*center, *logarithms, *channels, depth, *extents])
+    return table, finite & (bounded | ~in_front)
 
 
 def _finite(gaussians: Gaussians, features: Float[Array, "n d"]) -> Bool[Array, " n"]:

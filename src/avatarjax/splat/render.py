@@ -153,11 +153,11 @@ def _draw(
 ) -> tuple[Float[Array, "t c p"], Int[Array, " 3"]]:
     """The blended tiles of a shard, which projects its part of the Gaussians; and intersections, those dropped, and the
     Gaussians that are not finite, of all shards."""
-    splats, finite = project(gaussians, features, camera, config)
-    splats = sharding.gather(splats, config.shards)
+    table, finite = project(gaussians, features, camera, config)
+    table = sharding.gather(table, config.shards)
     shard = sharding.index(config.shards)
-    lists = tiles.bin_splats(splats, grid, -(-capacity // config.shards), shard, config.cull_ellipses)
-    blended = blend(splats.table, lists, grid.corners(shard), config)
+    lists = tiles.bin_splats(table, grid, -(-capacity // config.shards), shard, config.cull_ellipses)
+    blended: Float[Array, "t c p"] = blend(table, lists, grid.corners(shard), config)
     counts = jnp.stack([lists.total, lists.dropped, jnp.sum(~finite, dtype=jnp.int32)])
     return blended, sharding.total(counts, config.shards)
 
@@ -167,9 +167,9 @@ def _count(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> Int[Ar
     """Intersections in each view and shard."""
 
     def count(camera):
-        splats, _ = project(gaussians, gaussians.colors, camera, config)
+        table, _ = project(gaussians, gaussians.colors, camera, config)
         grid = _grid(camera, config)
-        return jnp.stack([tiles.count_intersections(splats, grid, k) for k in range(config.shards)])
+        return jnp.stack([tiles.count_intersections(table, grid, k) for k in range(config.shards)])
 
     return jax.lax.map(count, cameras)
 

@@ -51,11 +51,9 @@ def _pad(x: Float[Array, "n ..."], shards: int) -> Float[Array, "n2 ..."]:
     return jnp.pad(x, ((0, rows),) + ((0, 0),) * (x.ndim - 1), constant_values=fill)
 
 
-def gather(tree: typing.Any, shards: int) -> typing.Any:
+def gather(rows: Float[Array, "n k"], shards: int) -> Float[Array, "m k"]:
     """The rows of all shards."""
-    if shards == 1:
-        return tree
-    return jax.tree.map(lambda x: lax.all_gather(x, _AXIS, tiled=True), tree)
+    return rows if shards == 1 else lax.all_gather(rows, _AXIS, tiled=True)
 
 
 def index(shards: int) -> Int[Array, ""] | int:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from avatarjax.splat import columns, sorting
 from avatarjax.splat.config import ALPHA_MIN
-from avatarjax.splat.project import CHANNELS, Splats, X, Y
+from avatarjax.splat.project import CHANNELS, DEPTH, EXTENT_X, EXTENT_Y, X, Y
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,7 @@ class _Boxes(typing.NamedTuple):
 
 
 def bin_splats(
-    splats: Splats, grid: TileGrid, capacity: int, shard: Int[Array, ""] | int = 0, cull: bool = False
+    table: Float[Array, "n k"], grid: TileGrid, capacity: int, shard: Int[Array, ""] | int = 0, cull: bool = False
 ) -> TileLists:
     """Lists of the Gaussians whose bounding box, or with `cull` whose ellipse, meets a tile of a shard.
 
@@ -93,19 +93,21 @@ def bin_splats(
     """
     one_scene = functools.partial(_bin_splats, grid=grid, capacity=capacity, cull=cull)
     binned = jax.custom_batching.sequential_vmap(one_scene)
-    return binned(jax.lax.stop_gradient(splats), jnp.int32(shard))
+    return binned(jax.lax.stop_gradient(table), jnp.int32(shard))
 
 
-def count_intersections(splats: Splats, grid: TileGrid, shard: Int[Array, ""] | int = 0) -> Int[Array, ""]:
+def count_intersections(table: Float[Array, "n k"], grid: TileGrid, shard: Int[Array, ""] | int = 0) -> Int[Array, ""]:
     """Number of tiles in the bounding boxes of all Gaussians, exact up to 2^24, at most 2^30."""
-    tiles = _boxes(splats, grid, jnp.int32(shard)).tiles
+    tiles = _boxes(table, grid, jnp.int32(shard)).tiles
     return sorting.exclusive_sum(tiles)[-1] + tiles[-1]
 
 
-def _bin_splats(splats: Splats, shard: Int[Array, ""], *, grid: TileGrid, capacity: int, cull: bool) -> TileLists:
-    n, depth = splats.table.shape[0], splats.table[:, -1]
-    boxes = _boxes(splats, grid, shard)
-    order = sorting.depth_order(depth, boxes.tiles > 0)
+def _bin_splats(
+    table: Float[Array, "n k"], shard: Int[Array, ""], *, grid: TileGrid, capacity: int, cull: bool
+) -> TileLists:
+    n = table.shape[0]
+    boxes = _boxes(table, grid, shard)
+    order = sorting.depth_order(table[:, DEPTH], boxes.tiles > 0)
     first_tile, across, tiles = columns.split(columns.take(columns.join(list(boxes)), order))
     starts = sorting.exclusive_sum(tiles)
     total = starts[-1] + tiles[-1]
@@ -122,21 +124,21 @@ def _bin_splats(splats: Splats, shard: Int[Array, ""], *, grid: TileGrid, capaci
     tile = first_tile + row * grid.columns + within - row * across
     used = layout.elements < jnp.minimum(total, capacity)
     if cull:
-        used &= _reached(splats.table, ids, grid.corners(shard), tile, grid)
+        used &= _reached(table, ids, grid.corners(shard), tile, grid)
     tile = jnp.where(used, tile, grid.tiles)
     ids, starts, ends = sorting.group_by_key(tile, ids, grid.tiles)
     return TileLists(ids, starts, ends, total, jnp.maximum(total - capacity, 0))
 
 
-def _boxes(splats: Splats, grid: TileGrid, shard: Int[Array, ""]) -> _Boxes:
-    x0, x1 = _tile_range(splats.table[:, X], splats.extents[:, 0], grid.tile_width, grid.columns)
-    y0, y1 = _tile_range(splats.table[:, Y], splats.extents[:, 1], grid.tile_height, grid.image_rows)
+def _boxes(table: Float[Array, "n k"], grid: TileGrid, shard: Int[Array, ""]) -> _Boxes:
+    x0, x1 = _tile_range(table[:, X], table[:, EXTENT_X], grid.tile_width, grid.columns)
+    y0, y1 = _tile_range(table[:, Y], table[:, EXTENT_Y], grid.tile_height, grid.image_rows)
     # Of the rows of the image, one in `shards` is this shard's.
     y0, y1 = ((y - shard + grid.shards - 1) // grid.shards for y in (y0, y1))
     return _Boxes(
         first_tile=y0 * grid.columns + x0,
         columns=jnp.maximum(x1 - x0, 1),
-        tiles=jnp.where(splats.extents[:, 0] > 0, (x1 - x0) * (y1 - y0), 0),
+        tiles=jnp.where(table[:, EXTENT_X] > 0, (x1 - x0) * (y1 - y0), 0),
     )
 
 
