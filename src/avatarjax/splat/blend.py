@@ -29,10 +29,10 @@ def blend(
 ) -> Float[Array, "t c p"]:
     """Blend the channels of projected Gaussians over every tile; the last of the c results is the transmittance.
 
-    `table` as `project` makes it. `corners` are the upper left corners of the tiles, pixels. Differentiable with respect to the table. An entry counts
-    from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is finished once no pixel of it lets more than TRANSMITTANCE_MIN
-    through. Under `jax.vmap` the scenes are blended one after another: on two CPU cores that is as fast as letting the
-    tiles of all scenes share the lanes.
+    `table` as `project` makes it; `corners` are the upper left corners of the tiles, pixels. Differentiable with respect
+    to the table. An entry counts from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is finished once no pixel of it lets
+    more than TRANSMITTANCE_MIN through. Under `jax.vmap` the scenes are blended one after another: on two CPU cores that
+    is as fast as letting the tiles of all scenes share the lanes.
     """
     return _blend_fwd(table, lists, corners, config)[0]
 
