@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 import typing
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from avatarjax import Camera, Gaussians
 from avatarjax.splat import SplatConfig, render, required_capacity
 from avatarjax.splat.reference import render_reference
 from benchmarks import scenes, splat_prototype
-from benchmarks.timing import Contender, Unavailable
+from benchmarks.timing import BACKWARD, FORWARD, Contender, Unavailable
 
 # The naive renderer holds a dozen arrays of this many float32 numbers.
 _NAIVE_MAX = 200_000_000
@@ -112,11 +112,16 @@ def mitsuba(scene: Scene) -> Contender:
 
     renderer = splat_mitsuba.Renderer(*scene.make())
     weights = scene.weights()
+
+    def compile_pass(which):
+        renderer.image() if which == FORWARD else renderer.gradient(weights)
+        splat_mitsuba.release()
+
     return Contender(
         forward=renderer.image,
         backward=lambda: renderer.gradient(weights),
         image=lambda: np.array(renderer.image()),
-        release=splat_mitsuba.release,
+        compile=compile_pass,
     )
 
 
@@ -130,17 +135,26 @@ class _Drawn(typing.NamedTuple):
     alpha: jax.Array
 
 
-def _jax_contender(draw: Callable, cloud: typing.Any, camera: Camera, weights: jax.Array) -> Contender:
+def _jax_contender(draw: typing.Any, cloud: typing.Any, camera: Camera, weights: jax.Array) -> Contender:
     """Of a jitted `draw(cloud, camera)`, which returns image and alpha, and counts by name."""
 
     def loss(cloud, camera, weights):
         drawn, _ = draw(cloud, camera)
         return jnp.sum(drawn.image * weights) + jnp.sum(drawn.alpha)
 
-    gradient = jax.jit(jax.value_and_grad(loss))
+    @functools.cache
+    def compiled(which):
+        if which == FORWARD:
+            return draw.lower(cloud, camera).compile()
+        return jax.jit(jax.value_and_grad(loss)).lower(cloud, camera, weights).compile()
+
+    def forward():
+        return jax.block_until_ready(compiled(FORWARD)(cloud, camera))
+
     return Contender(
-        forward=lambda: jax.block_until_ready(draw(cloud, camera)),
-        backward=lambda: jax.block_until_ready(gradient(cloud, camera, weights)),
-        image=lambda: np.asarray(draw(cloud, camera)[0].image),
-        counts=lambda: {name: int(count) for name, count in draw(cloud, camera)[1].items()},
+        forward=forward,
+        backward=lambda: jax.block_until_ready(compiled(BACKWARD)(cloud, camera, weights)),
+        image=lambda: np.asarray(forward()[0].image),
+        counts=lambda: {name: int(count) for name, count in forward()[1].items()},
+        compile=compiled,
     )

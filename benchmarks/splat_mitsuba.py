@@ -3,7 +3,7 @@
 It takes `pip install mitsuba` (3.9.1 was measured) and the shared library of LLVM, which Dr.Jit loads: on Debian 12
 `apt-get install libllvm19`, elsewhere set the environment variable DRJIT_LIBLLVM_PATH to a libLLVM.so. With LLVM 15 the
 process ends with "Cannot select: fminimum" on processors with AVX-512. Dr.Jit keeps compiled kernels on disk, so
-compile times are true only for the first run on a machine.
+compile times, which hold a first pass, are true only for the first run on a machine.
 
 Its model is another one: rays meet ellipsoids in the order of their surfaces, a Gaussian is evaluated at its largest
 along the ray, without the blur of 0.3 square pixels, within three standard deviations, and a ray ends at a

@@ -30,8 +30,8 @@ class Unavailable(Exception):
 
 
 class Prepared(typing.NamedTuple):
-    """Seconds that the first call took beyond the second, mostly for compiling; bytes that the third call added to the
-    memory of the process at its peak, None where the system does not tell."""
+    """Seconds to compile; bytes that the first call after that added to the memory of the process at its peak, None
+    where the system does not tell."""
 
     compile: float
     memory: int | None
@@ -42,21 +42,18 @@ class Contender:
     """Two passes that return when all is computed, and what they compute.
 
     forward: the image; backward: the image and the gradient of a loss. image: (h, w, 3). counts: numbers that the
-    contender alone knows. release: give memory kept for reuse back to the system.
+    contender alone knows. compile: compile a pass.
     """
 
     forward: Callable[[], object]
     backward: Callable[[], object]
     image: Callable[[], np.ndarray]
     counts: Callable[[], dict[str, int]] = dict
-    release: Callable[[], None] = lambda: None
+    compile: Callable[[str], object] = lambda which: None
 
     def prepare(self, which: str) -> Prepared:
-        """Run a pass, FORWARD or BACKWARD, for the first three times."""
-        run = getattr(self, which)
-        first, second = seconds(run), seconds(run)
-        self.release()
-        return Prepared(max(first - second, 0.0), _peak_memory(run))
+        """Compile a pass, FORWARD or BACKWARD, and run it for the first time."""
+        return Prepared(seconds(lambda: self.compile(which)), _peak_memory(getattr(self, which)))
 
     def burst(self, which: str, runs: int, limit: float) -> list[float]:
         """Seconds of `runs` runs of a pass, one after another; of fewer, but one, where all take more than `limit`."""
@@ -146,7 +143,7 @@ def _peak_memory(run: Callable[[], object]) -> int | None:
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     if not reset.exists():
         return None
-    # Or else the call would reuse, unseen, what compiling has freed.
+    # Or else the call would reuse, unseen, what was freed before.
     ctypes.CDLL(None).malloc_trim(0)
     reset.write_text("5")
     before = _kibibytes(status.read_text(), "VmRSS")
