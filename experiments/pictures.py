@@ -81,7 +81,7 @@ def draw_frames(gaussians: Gaussians, roots: jax.Array, size: int, *, label: str
     capacity = max(
         required_capacity(jax.tree.map(lambda x, k=k: x[k], gaussians), follow(cameras, positions[k])) for k in probe
     )
-    config = SplatConfig(capacity=2 * capacity)
+    config = SplatConfig(capacity=2 * capacity, depth=False)
     dropped = 0
     for start in tqdm(range(0, frames, CHUNK), desc=label, unit=f"{CHUNK} frames"):
         chosen = np.minimum(np.arange(start, start + CHUNK), frames - 1)

@@ -405,6 +405,21 @@ def test_thin_huge_gaussian_matches_the_reference():
     np.testing.assert_allclose(render(gaussians, camera).image, expected.image, atol=2e-3)
 
 
+@pytest.mark.parametrize("n", [0, 20])
+def test_picture_without_depth_is_the_same_with_the_same_gradients(n):
+    camera = front_camera(16, 12)
+    gaussians = random_gaussians(n=n)
+
+    def energy(depth):
+        loss = lambda g: jnp.sum(render(g, camera, background=0.2, config=SplatConfig(depth=depth)).image ** 2)  # noqa: E731
+        return jax.jit(jax.value_and_grad(loss))(gaussians)
+
+    assert render(gaussians, camera, config=SplatConfig(depth=False)).depth is None
+    (got, gradient), (expected, with_depth) = energy(False), energy(True)
+    np.testing.assert_allclose(got, expected, rtol=1e-6)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), gradient, with_depth)
+
+
 def test_scalar_background_is_grey():
     gaussians, camera = small_scene()
     grey = render(gaussians, camera, background=jnp.full(3, 0.5))

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from avatarjax.splat import columns, lanes
 from avatarjax.splat.config import ALPHA_MAX, ALPHA_MIN, SplatConfig
-from avatarjax.splat.project import CHANNELS, EXTENT_X, LOG2_OPACITY, XX, XY, YY, X, Y
+from avatarjax.splat.project import CHANNELS, DEPTH, EXTENT_X, LOG2_OPACITY, XX, XY, YY, X, Y
 from avatarjax.splat.tiles import TileLists
 
 
@@ -27,20 +27,20 @@ from avatarjax.splat.tiles import TileLists
 def blend(
     table: Float[Array, "n k"], lists: TileLists, corners: Float[Array, "t 2"], config: SplatConfig
 ) -> Float[Array, "t c p"]:
-    """Blend the channels of projected Gaussians over every tile; the last of the c results is the transmittance.
+    """Blend the features and the depth of projected Gaussians over every tile; the last result is the transmittance.
 
-    `table` as `project` makes it; `corners` are the upper left corners of the tiles, pixels. Differentiable with respect
-    to the table. An entry counts from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is finished once no pixel of it lets
-    more than TRANSMITTANCE_MIN through. Under `jax.vmap` the scenes are blended one after another: on two CPU cores that
-    is as fast as letting the tiles of all scenes share the lanes.
+    `table` as `project` makes it; `corners` are the upper left corners of the tiles, pixels. Differentiable with
+    respect to the table. An entry counts from ALPHA_MIN and is clamped at ALPHA_MAX; a tile is finished once no pixel
+    of it lets more than TRANSMITTANCE_MIN through. Under `jax.vmap` the scenes are blended one after another: on two
+    CPU cores that is as fast as letting the tiles of all scenes share the lanes.
     """
     return _blend_fwd(table, lists, corners, config)[0]
 
 
 def _blend_fwd(table, lists, corners, config):
-    # Without the extents, and with a last row that is transparent, for lanes past the end of their list.
+    # Without the columns that are not drawn, and with a last row that is transparent, for lanes at the end of a list.
     blank = jnp.zeros((1, table.shape[1]), jnp.float32).at[0, LOG2_OPACITY].set(-1e9)
-    table = _first_order(jnp.concatenate([table, blank])[:, :EXTENT_X])
+    table = _first_order(jnp.concatenate([table, blank])[:, : _undrawn(config)])
     forward = lanes.by_platform(functools.partial(_forward, config=config), config.forward_lanes, corners.shape[0])
     blended = jax.custom_batching.sequential_vmap(forward)(table, lists, corners)
     return blended, (table, lists, corners, blended)
@@ -52,7 +52,12 @@ def _blend_bwd(config, residuals, cotangent):
     backward = lanes.by_platform(functools.partial(_backward, config=config), config.backward_lanes, corners.shape[0])
     backward = jax.custom_batching.sequential_vmap(backward)
     gradient = backward(table, lists, corners, blended, cotangent)
-    return jnp.pad(gradient[:-1], ((0, 0), (0, -EXTENT_X))), None, None
+    return jnp.pad(gradient[:-1], ((0, 0), (0, -_undrawn(config)))), None, None
+
+
+def _undrawn(config: SplatConfig) -> int:
+    """The first of the last columns that are no channels."""
+    return EXTENT_X if config.depth else DEPTH
 
 
 blend.defvjp(_blend_fwd, _blend_bwd)

@@ -42,11 +42,12 @@ class RenderInfo:
 @flax.struct.dataclass
 class RenderOutput:
     """image (h, w, d) over the background, in the space of the colours or features; alpha (h, w) in [0, 1]; depth
-    (h, w) metres, the mean depth of what a pixel shows, 0 where it shows nothing; info."""
+    (h, w) metres, the mean depth of what a pixel shows, 0 where it shows nothing, None with `SplatConfig(depth=False)`;
+    info."""
 
     image: Float[Array, "h w d"]
     alpha: Float[Array, "h w"]
-    depth: Float[Array, "h w"]
+    depth: Float[Array, "h w"] | None
     info: RenderInfo
 
 
@@ -125,19 +126,20 @@ def _render(
     config: SplatConfig,
 ) -> RenderOutput:
     if len(gaussians) == 0:
-        return _nothing(camera, background)
+        return _nothing(camera, background, config)
     grid = _grid(camera, config)
     capacity = config.capacity or default_capacity(len(gaussians), grid.tiles * grid.shards)
     draw = functools.partial(_draw, grid=grid, capacity=capacity, config=config)
     blended, counts = sharding.over_rows(draw, config.shards)(gaussians, features, camera)
     blended = grid.assemble(blended)
-    colors, depth, transmittance = blended[..., :-2], blended[..., -2], blended[..., -1]
+    channels = background.shape[0]
+    transmittance = blended[..., -1]
     alpha = 1 - transmittance
     seen = alpha > 0
     return RenderOutput(
-        image=colors + transmittance[..., None] * background[None, None],
+        image=blended[..., :channels] + transmittance[..., None] * background[None, None],
         alpha=alpha,
-        depth=jnp.where(seen, depth / jnp.where(seen, alpha, 1.0), 0.0),
+        depth=jnp.where(seen, blended[..., channels] / jnp.where(seen, alpha, 1.0), 0.0) if config.depth else None,
         info=RenderInfo(*counts, capacity),
     )
 
@@ -178,12 +180,15 @@ def _grid(camera: Camera, config: SplatConfig) -> tiles.TileGrid:
     return tiles.TileGrid(camera.width, camera.height, config.tile_width, config.tile_height, config.shards)
 
 
-def _nothing(camera: Camera, background: Float[Array, " d"]) -> RenderOutput:
+def _nothing(camera: Camera, background: Float[Array, " d"], config: SplatConfig) -> RenderOutput:
     size = (camera.height, camera.width)
     none = jnp.int32(0)
-    info = RenderInfo(none, none, none, capacity=0)
-    image = jnp.broadcast_to(background, (*size, background.shape[0]))
-    return RenderOutput(image, jnp.zeros(size), jnp.zeros(size), info)
+    return RenderOutput(
+        image=jnp.broadcast_to(background, (*size, background.shape[0])),
+        alpha=jnp.zeros(size),
+        depth=jnp.zeros(size) if config.depth else None,
+        info=RenderInfo(none, none, none, capacity=0),
+    )
 
 
 def _check(gaussians: Gaussians, camera: Camera) -> None:

@@ -125,7 +125,7 @@ def _bin_splats(
     used = layout.elements < jnp.minimum(total, capacity)
     if cull:
         used &= _reached(table, ids, grid.corners(shard), tile, grid)
-    tile = jnp.where(used, tile, grid.tiles)
+    tile = columns.materialize(jnp.where(used, tile, grid.tiles))
     ids, starts, ends = sorting.group_by_key(tile, ids, grid.tiles)
     return TileLists(ids, starts, ends, total, jnp.maximum(total - capacity, 0))
 
@@ -163,9 +163,9 @@ def _reached(
     The largest value of a concave quadratic form over a rectangle is on the sides that face its centre, if that is
     outside.
     """
-    entry = columns.take(table[:, :CHANNELS], ids)
+    entry = columns.materialize(columns.take(columns.join(columns.split(table[:, :CHANNELS])), ids))
     x, y, xx, xy, yy, log2_opacity = (entry[..., k] for k in range(CHANNELS))
-    corner = columns.take(corners, jnp.minimum(tile, grid.tiles - 1))
+    corner = columns.materialize(columns.take(corners, jnp.minimum(tile, grid.tiles - 1)))
     x0, y0 = corner[..., 0] + 0.5 - x, corner[..., 1] + 0.5 - y
     x1, y1 = x0 + (grid.tile_width - 1), y0 + (grid.tile_height - 1)
     side_x, side_y = jnp.clip(0.0, x0, x1), jnp.clip(0.0, y0, y1)

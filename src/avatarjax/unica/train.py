@@ -295,7 +295,7 @@ def pick_views(cameras: Camera, views: np.ndarray) -> Camera:
 
 def splat_config(gaussians: typing.Any, cameras: Camera) -> SplatConfig:
     """Room for three times what the cloud needs before training: its Gaussians will grow."""
-    return SplatConfig(capacity=min(2**24, 3 * required_capacity(gaussians, cameras)))
+    return SplatConfig(capacity=min(2**24, 3 * required_capacity(gaussians, cameras)), depth=False)
 
 
 def train_base(config: UnicaConfig, data: Dataset, run: Run, upscaler: posmap.Upscaler) -> appearance.BaseAttributes:
