@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from avatarjax.splat import columns, lanes
 from avatarjax.splat.config import ALPHA_MAX, ALPHA_MIN, SplatConfig
@@ -38,26 +38,16 @@ def blend(
 
 
 def _blend_fwd(table, lists, corners, config):
-    # Without the columns that are not drawn, and with a last row that is transparent, for lanes at the end of a list.
-    blank = jnp.zeros((1, table.shape[1]), jnp.float32).at[0, LOG2_OPACITY].set(-1e9)
-    table = _first_order(jnp.concatenate([table, blank])[:, : _undrawn(config)])
     forward = lanes.by_platform(functools.partial(_forward, config=config), config.forward_lanes, corners.shape[0])
-    blended = jax.custom_batching.sequential_vmap(forward)(table, lists, corners)
+    blended = jax.custom_batching.sequential_vmap(forward)(_first_order(table), lists, corners)
     return blended, (table, lists, corners, blended)
 
 
 def _blend_bwd(config, residuals, cotangent):
     table, lists, corners, blended = residuals
-    cotangent = _first_order(cotangent)
     backward = lanes.by_platform(functools.partial(_backward, config=config), config.backward_lanes, corners.shape[0])
     backward = jax.custom_batching.sequential_vmap(backward)
-    gradient = backward(table, lists, corners, blended, cotangent)
-    return jnp.pad(gradient[:-1], ((0, 0), (0, -_undrawn(config)))), None, None
-
-
-def _undrawn(config: SplatConfig) -> int:
-    """The first of the last columns that are no channels."""
-    return EXTENT_X if config.depth else DEPTH
+    return backward(table, lists, corners, blended, _first_order(cotangent)), None, None
 
 
 blend.defvjp(_blend_fwd, _blend_bwd)
@@ -93,8 +83,8 @@ def _forward(
     config: SplatConfig,
     n_lanes: int,
 ) -> Float[Array, "t c p"]:
-    n_tiles, n_channels = corners.shape[0], table.shape[1] - CHANNELS
-    steps = config.forward_steps
+    n_tiles, drawn = corners.shape[0], _channels(table, config)
+    n_channels, steps = drawn.stop - drawn.start, config.forward_steps
     pixels = jnp.asarray(_pixels(config), jnp.float32)
     queue, work = lanes.start(lists, n_lanes)
     corners = jnp.pad(corners, ((0, 1), (0, 0)))
@@ -102,13 +92,13 @@ def _forward(
     spare = n_tiles + jnp.arange(n_lanes, dtype=jnp.int32)
 
     def iterate(s: _Forward) -> _Forward:
-        chosen = lanes.entries(s.work, queue, lists, steps, table.shape[0] - 1)
+        chosen, listed = lanes.entries(s.work, queue, lists, steps)
         rows = lanes.in_place(s.rows, columns.take(table, chosen), s.work)
-        alphas = lanes.in_place(s.alphas, _alphas(rows[:-1], pixels, corners[s.work.tile]), s.work)
+        alphas = lanes.in_place(s.alphas, _alphas(rows[:-1], listed, pixels, corners[s.work.tile]), s.work)
         # Horner's scheme over the entries, back to front: one product less per entry than summing up weights.
         mixed = jnp.zeros_like(s.channels)
         for k in reversed(range(steps)):
-            mixed = mixed + alphas[:-1, k, None] * (rows[:-1, k, CHANNELS:, None] - mixed)
+            mixed = mixed + alphas[:-1, k, None] * (rows[:-1, k, drawn, None] - mixed)
         mixed = lanes.in_place(s.mixed, mixed, s.work)
         channels = s.channels + s.transmittance[:, None] * mixed[:-1]
         transmittance = s.transmittance
@@ -167,7 +157,8 @@ def _backward(
     n_lanes: int,
 ) -> Float[Array, "n k"]:
     """Gradient of the table. What matters of the channels is their product with the cotangent, one number a pixel."""
-    n_channels, steps = table.shape[1] - CHANNELS, config.backward_steps
+    drawn, steps = _channels(table, config), config.backward_steps
+    n_channels = drawn.stop - drawn.start
     pixels, monomials = jnp.asarray(_pixels(config), jnp.float32), _monomials(config)
     center = jnp.asarray([config.tile_width / 2, config.tile_height / 2], jnp.float32)
     queue, work = lanes.start(lists, n_lanes)
@@ -177,12 +168,12 @@ def _backward(
     weights = jnp.pad(cotangent[:, :n_channels], ((0, 1), (0, 0), (0, 0)))
 
     def iterate(s: _Backward) -> _Backward:
-        chosen = lanes.entries(s.work, queue, lists, steps, table.shape[0] - 1)
+        chosen, listed = lanes.entries(s.work, queue, lists, steps)
         corner = corners[s.work.tile]
         rows = lanes.in_place(s.rows, columns.take(table, chosen), s.work)
         entry = rows[:-1]
         v = lanes.in_place(s.weights, weights[s.work.tile], s.work)
-        alphas = lanes.in_place(s.alphas, _alphas(entry, pixels, corner), s.work)
+        alphas = lanes.in_place(s.alphas, _alphas(entry, listed, pixels, corner), s.work)
         alpha = alphas[:-1]
         before, through = _exclusive(jnp.multiply, 1 - alpha, 1.0)
         visibility = lanes.in_place(s.visibility, s.transmittance[:, None] * before * alpha, s.work)
@@ -206,7 +197,7 @@ def _backward(
             work=work,
             transmittance=jnp.where(done[:, None], 1.0, transmittance),
             behind=jnp.where(done[:, None], behind[work.tile], s.behind - total),
-            gradient=s.gradient.at[chosen.reshape(-1)].add(d_rows, mode="promise_in_bounds"),
+            gradient=s.gradient.at[chosen.reshape(-1), : drawn.stop].add(d_rows, mode="promise_in_bounds"),
             rows=rows,
             weights=v,
             alphas=alphas,
@@ -268,13 +259,20 @@ def _pixels(config: SplatConfig) -> np.ndarray:
     return np.stack([index % config.tile_width, index // config.tile_width], axis=1) + np.float32(0.5)
 
 
+def _channels(table: Float[Array, "n k"], config: SplatConfig) -> slice:
+    """Which columns are drawn."""
+    return slice(CHANNELS, table.shape[1] + (EXTENT_X if config.depth else DEPTH))
+
+
 def _alphas(
-    entry: Float[Array, "l s k"], pixels: Float[Array, "p 2"], corner: Float[Array, "l 2"]
+    entry: Float[Array, "l s k"], listed: Bool[Array, "l s"], pixels: Float[Array, "p 2"], corner: Float[Array, "l 2"]
 ) -> Float[Array, "l s p"]:
     column = [entry[..., k, None] for k in range(CHANNELS)]
     dx = pixels[None, None, :, 0] - (column[X] - corner[:, :1, None])
     dy = pixels[None, None, :, 1] - (column[Y] - corner[:, 1:, None])
-    alpha = _exp2(column[LOG2_OPACITY] + (column[XX] * dx + column[XY] * dy) * dx + column[YY] * dy * dy)
+    # What is not in the list is transparent.
+    log2_opacity = jnp.where(listed[..., None], column[LOG2_OPACITY], -1e9)
+    alpha = _exp2(log2_opacity + (column[XX] * dx + column[XY] * dy) * dx + column[YY] * dy * dy)
     return jnp.where(alpha >= ALPHA_MIN, jnp.minimum(alpha, ALPHA_MAX), 0.0)
 
 

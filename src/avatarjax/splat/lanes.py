@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from avatarjax.splat import columns
 from avatarjax.splat.config import TRANSMITTANCE_MIN
 from avatarjax.splat.tiles import TileLists
 
@@ -72,11 +73,11 @@ def busy(work: Work, queue: Queue) -> Bool[Array, ""]:
     return jnp.any(work.tile < queue.none)
 
 
-def entries(work: Work, queue: Queue, lists: TileLists, steps: int, blank: int) -> Int[Array, "l s"]:
-    """The next `steps` rows of each lane; past the end of its list, the row `blank`."""
+def entries(work: Work, queue: Queue, lists: TileLists, steps: int) -> tuple[Int[Array, "l s"], Bool[Array, "l s"]]:
+    """The next `steps` Gaussians of each lane, and which of them are in its list; those behind its end are any."""
     places = work.position[:, None] + jnp.arange(steps, dtype=jnp.int32)[None]
-    ids = lists.ids[jnp.minimum(places, lists.ids.shape[0] - 1)]
-    return jnp.where(places < queue.ends[work.tile][:, None], ids, blank)
+    ids = columns.take(lists.ids, jnp.minimum(places, lists.ids.shape[0] - 1))
+    return ids, places < queue.ends[work.tile][:, None]
 
 
 def advance(work: Work, queue: Queue, steps: int, transmittance: Float[Array, "l p"]) -> tuple[Bool[Array, " l"], Work]:
