@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from avatarjax.splat import columns, sorting
 from avatarjax.splat.config import ALPHA_MIN
-from avatarjax.splat.project import CHANNELS, DEPTH, EXTENT_X, EXTENT_Y, X, Y
+from avatarjax.splat.project import CHANNELS, DEPTH, EXTENT_X, EXTENT_Y, XX, XY, YY, X, Y
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +124,7 @@ def _bin_splats(
     tile = first_tile + row * grid.columns + within - row * across
     used = layout.elements < jnp.minimum(total, capacity)
     if cull:
-        used &= _reached(table, ids, grid.corners(shard), tile, grid)
+        used &= _reached(table, ids, tile, grid, shard)
     tile = columns.materialize(jnp.where(used, tile, grid.tiles))
     ids, starts, ends = sorting.group_by_key(tile, ids, grid.tiles)
     return TileLists(ids, starts, ends, total, jnp.maximum(total - capacity, 0))
@@ -152,25 +152,24 @@ def _tile_range(
 
 
 def _reached(
-    table: Float[Array, "n k"],
-    ids: Int[Array, "r c"],
-    corners: Float[Array, "t 2"],
-    tile: Int[Array, "r c"],
-    grid: TileGrid,
+    table: Float[Array, "n k"], ids: Int[Array, "r c"], tile: Int[Array, "r c"], grid: TileGrid, shard: Int[Array, ""]
 ) -> Bool[Array, "r c"]:
     """Whether the ellipse within which a Gaussian counts meets the rectangle of a tile's pixel centres.
 
     The largest value of a concave quadratic form over a rectangle is on the sides that face its centre, if that is
     outside.
     """
-    entry = columns.materialize(columns.take(columns.join(columns.split(table[:, :CHANNELS])), ids))
-    x, y, xx, xy, yy, log2_opacity = (entry[..., k] for k in range(CHANNELS))
-    corner = columns.materialize(columns.take(corners, jnp.minimum(tile, grid.tiles - 1)))
-    x0, y0 = corner[..., 0] + 0.5 - x, corner[..., 1] + 0.5 - y
+    # Divisions are made for each Gaussian, not for each entry: XLA on CPU would read all columns again for each.
+    ratios = [-0.5 * table[:, XY] / table[:, XX], -0.5 * table[:, XY] / table[:, YY]]
+    entry = columns.materialize(columns.take(columns.join([*columns.split(table[:, :CHANNELS]), *ratios]), ids))
+    x, y, xx, xy, yy, log2_opacity, ratio_x, ratio_y = (entry[..., k] for k in range(CHANNELS + 2))
+    row = ((tile.astype(jnp.float32) + 0.5) * (1 / grid.columns)).astype(jnp.int32)
+    corner_x = ((tile - row * grid.columns) * grid.tile_width).astype(jnp.float32)
+    corner_y = ((row * grid.shards + shard) * grid.tile_height).astype(jnp.float32)
+    x0, y0 = corner_x + 0.5 - x, corner_y + 0.5 - y
     x1, y1 = x0 + (grid.tile_width - 1), y0 + (grid.tile_height - 1)
     side_x, side_y = jnp.clip(0.0, x0, x1), jnp.clip(0.0, y0, y1)
-    along_y = jnp.clip(-0.5 * xy * side_x / yy, y0, y1)
-    along_x = jnp.clip(-0.5 * xy * side_y / xx, x0, x1)
+    along_x, along_y = jnp.clip(ratio_x * side_y, x0, x1), jnp.clip(ratio_y * side_x, y0, y1)
 
     def logarithm(dx, dy):
         return xx * dx * dx + xy * dx * dy + yy * dy * dy
