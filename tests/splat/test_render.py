@@ -392,6 +392,17 @@ def test_gaussian_that_is_not_finite_leaves_all_gradients_finite(field):
     assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradients))
 
 
+@pytest.mark.parametrize(
+    ("field", "value"), [("log_scales", 30.0), ("log_scales", 60.0), ("means", 1e38), ("means", (1e38, 0.0, 0.0))]
+)
+def test_gaussian_that_overflows_leaves_all_gradients_finite(field, value):
+    gaussians, camera = random_gaussians(n=20), front_camera(16, 12, eye=(0.0, 0.0, 3.0))
+    x = getattr(gaussians, field)
+    # The first is what is read past the end of the last list.
+    gradients = energy_gradients(gaussians.replace(**{field: x.at[0].set(jnp.asarray(value))}), camera)
+    assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradients))
+
+
 def test_zero_quaternion_has_finite_gradients():
     gaussians, camera = small_scene()
     gradients = energy_gradients(gaussians.replace(quats=jnp.zeros((20, 4))), camera)

@@ -18,6 +18,8 @@ from avatarjax.splat.config import ALPHA_MIN, SplatConfig
 
 # Square pixels. The determinant of larger covariances would come near the largest float32.
 _VARIANCE_MAX = 1e15
+# Larger sizes, 10^13 metres, would overflow in the gradient before they are found to be too large.
+_LOG_SCALE_MAX = 30.0
 _LOG2_E = math.log2(math.e)
 
 # Columns of the table of projected Gaussians, one row each, which the blending reads at once.
@@ -34,7 +36,7 @@ def project(
 ) -> tuple[Float[Array, "n k"], Bool[Array, " n"]]:
     """The table of n Gaussians as one camera sees them, and which of them are free of NaN, infinity and overflow.
 
-    Those that are not drawn have no extent, and finite values without meaning.
+    Those that are not drawn have no extent, and values without meaning.
 
     The perspective is linearised at each centre, which is first moved to within 1.3 times the field of view: farther
     out the linearisation would spread a Gaussian over the whole image (Kerbl et al. 2023, and gsplat).
@@ -42,7 +44,8 @@ def project(
     finite = _finite(gaussians, features)
     # Masked values go in, not only out: the gradient of a masked result is 0 * NaN otherwise.
     x, y, z = (jnp.where(finite, x, 0.0) for x in columns.split(gaussians.means))
-    scales = [jnp.exp(jnp.where(finite, s, 0.0)) for s in columns.split(gaussians.log_scales)]
+    log_scales = jnp.where(finite[:, None], jnp.minimum(gaussians.log_scales, _LOG_SCALE_MAX), 0.0)
+    scales = [jnp.exp(s) for s in columns.split(log_scales)]
     quats = jnp.where(finite[:, None], gaussians.quats, jnp.ones_like(gaussians.quats))
 
     r, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]

@@ -62,5 +62,5 @@ def index(shards: int) -> Int[Array, ""] | int:
 
 
 def total(counts: Int[Array, " k"], shards: int) -> Int[Array, " k"]:
-    """The sums over all shards."""
-    return counts if shards == 1 else lax.psum(counts, _AXIS)
+    """The sums over all shards, of counts up to 2^30, at most 2^30."""
+    return counts if shards == 1 else lax.psum(jnp.minimum(counts, 2**30 // shards), _AXIS)

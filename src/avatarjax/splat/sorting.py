@@ -90,13 +90,17 @@ def group_by_key(
     return lax.platform_dependent(keys, values, cpu=counting, default=comparing)
 
 
-def _group_counting(keys, values, n_keys):
+def _group_counting(
+    keys: Int[Array, "r c"], values: Int[Array, "r c"], n_keys: int
+) -> tuple[Int[Array, " m"], Int[Array, " k"], Int[Array, " k"]]:
     places, bounds = _places(keys, n_keys + 1)
     values = jnp.zeros(values.size, jnp.int32).at[places].set(values, unique_indices=True, mode="promise_in_bounds")
     return values, bounds[:-1], bounds[1:]
 
 
-def _group_lax(keys, values, n_keys):
+def _group_lax(
+    keys: Int[Array, "r c"], values: Int[Array, "r c"], n_keys: int
+) -> tuple[Int[Array, " m"], Int[Array, " k"], Int[Array, " k"]]:
     keys, values = (Columns(x.size, *x.shape).flat(x) for x in (keys, values))
     keys, values = lax.sort((keys, values), num_keys=1, is_stable=True)
     bounds = jnp.searchsorted(keys, jnp.arange(n_keys + 1, dtype=jnp.int32)).astype(jnp.int32)
