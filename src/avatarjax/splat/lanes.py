@@ -74,7 +74,8 @@ def busy(work: Work, queue: Queue) -> Bool[Array, ""]:
 
 
 def entries(work: Work, queue: Queue, lists: TileLists, steps: int) -> tuple[Int[Array, "l s"], Bool[Array, "l s"]]:
-    """The next `steps` Gaussians of each lane, and which of them are in its list; those behind its end are in others."""
+    """The next `steps` Gaussians of each lane, and which of them are in its list; behind its end come others that are
+    visible."""
     places = work.position[:, None] + jnp.arange(steps, dtype=jnp.int32)[None]
     ids = columns.take(lists.ids, jnp.minimum(places, lists.ids.shape[0] - 1))
     return ids, places < queue.ends[work.tile][:, None]
