@@ -191,7 +191,9 @@ def goals(results: dict[str, Result | str]) -> typing.Iterator[str]:
     """A line for each goal: ratio to the prototype, which draws no depth, of the fastest of ours."""
     for which, goal in GOALS.items():
         base = _median(results[PROTOTYPE], which)
-        ratios = {name: _median(results[name], which) / base for name in (OURS, TWO_DEVICES, NO_DEPTH)}
+        ratios = {
+            name: _median(results[name], which) / base for name in (OURS, TWO_DEVICES, NO_DEPTH) if name in results
+        }
         name, ratio = min(ratios.items(), key=lambda item: item[1])
         verdict = "reached" if ratio <= goal else "not reached"
         title = {FORWARD: "forward", BACKWARD: "forward+backward"}[which]
