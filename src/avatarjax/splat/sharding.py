@@ -45,7 +45,7 @@ def over_rows(draw: Callable, shards: int) -> Callable:
 
 
 def _pad(x: Float[Array, "n ..."], shards: int) -> Float[Array, "n2 ..."]:
-    """Rows for all shards alike: Gaussians of no size at the origin of the world."""
+    """Rows for all shards alike: transparent Gaussians at the origin of the world."""
     rows = -x.shape[0] % shards
     fill = -jnp.inf if x.ndim == 1 else 0.0
     return jnp.pad(x, ((0, rows),) + ((0, 0),) * (x.ndim - 1), constant_values=fill)
