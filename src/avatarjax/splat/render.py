@@ -66,13 +66,13 @@ def render(
     background: a scalar or (d,). Gaussians behind the near plane are not drawn; what did not fit or was not finite is
     counted in `info`. Opaque tiles are finished early, which leaves out at most 1e-4 of the light.
 
-    Reverse-mode derivatives are exact; `jax.jvp` and second derivatives raise TypeError (use
+    Reverse-mode derivatives are those of the picture with its early stop; `jax.jvp` and second derivatives raise TypeError (use
     `splat.reference.render_reference` for those). Raises ValueError for batched, wrongly shaped or non-float32 input,
     and where `config.shards` is more than the devices there are.
     """
     _check(gaussians, camera)
     if features is None:
-        features = gaussians.colors if gaussians.sh is None else view_colors(gaussians, camera)
+        features = view_colors(gaussians, camera)
     channels = features.shape[-1] if features.ndim == 2 else 1
     _check_array("features", features, (len(gaussians), channels))
     background = jnp.asarray(background, jnp.float32)

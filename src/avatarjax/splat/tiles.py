@@ -159,7 +159,7 @@ def _reached(
     The largest value of a concave quadratic form over a rectangle is on the sides that face its centre, if that is
     outside.
     """
-    # Divisions are made for each Gaussian, not for each entry: XLA on CPU would read all columns again for each.
+    # Divisions are made for each Gaussian, of which there are fewer than entries.
     ratios = [-0.5 * table[:, XY] / table[:, XX], -0.5 * table[:, XY] / table[:, YY]]
     entry = columns.materialize(columns.take(columns.join([*columns.split(table[:, :CHANNELS]), *ratios]), ids))
     x, y, xx, xy, yy, log2_opacity, ratio_x, ratio_y = (entry[..., k] for k in range(CHANNELS + 2))
