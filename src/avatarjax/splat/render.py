@@ -66,9 +66,9 @@ def render(
     background: a scalar or (d,). Gaussians behind the near plane are not drawn; what did not fit or was not finite is
     counted in `info`. Opaque tiles are finished early, which leaves out at most 1e-4 of the light.
 
-    Reverse-mode derivatives are those of the picture with its early stop; `jax.jvp` and second ones raise TypeError (use
-    `splat.reference.render_reference` for those). Raises ValueError for batched, wrongly shaped or non-float32 input,
-    and where `config.shards` is more than the devices there are.
+    Reverse-mode derivatives are those of the picture with its early stop; `jax.jvp` and second ones raise TypeError:
+    use `splat.reference.render_reference` for those. Raises ValueError for batched, wrongly shaped or non-float32
+    input, and where `config.shards` is more than the devices there are.
     """
     _check(gaussians, camera)
     if features is None:
