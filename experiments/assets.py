@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from avatarjax.data import body, clips, retargeting
+from avatarjax.data import body
+from avatarjax.data.motion import clips, retargeting
 from avatarjax.io import weights
 
 # The body and the eyeballs; the other groups are helper geometry for fitting MakeHuman's own clothes.

@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from avatarjax import posmap
-from avatarjax.data import avatars, clips, locomotion
+from avatarjax.data import avatars
 from avatarjax.data.avatars import AvatarMesh
-from avatarjax.data.locomotion import Motion
+from avatarjax.data.motion import clips, locomotion
+from avatarjax.data.motion.locomotion import Motion
 
 ACTIONS = ("idle", "forward", "backward", "left", "right")
 

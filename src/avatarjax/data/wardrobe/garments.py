@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from avatarjax.data.body import Rig
+from avatarjax.data.wardrobe import fabrics
+from avatarjax.physics.cloth import Fabric
 
 # A number, or one for each element.
 _Edge = np.ndarray | np.floating | float
@@ -15,10 +17,12 @@ _Edge = np.ndarray | np.floating | float
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of an avatar in its rest pose.
+    """A part of an avatar in its rest pose, which for cloth is also its pattern: the lengths it keeps.
 
-    vertices (v, 3) metres; faces (f, 3); uvs (f, 3, 2) corners in the unit square of the piece; weights (v, j), rows
-    sum to 1; lag (v,) in [0, 1]: how much of the vertex follows the lagged bones.
+    vertices (v, 3) metres; faces (f, 3); uvs (f, 3, 2) corners in the unit square of the piece, for cloth along its
+    threads; weights (v, j), rows sum to 1; reach (v,) metres that a vertex may leave the place where the skeleton
+    carries it: 0 rides on the bones, more is simulated as `fabric`; braces (b, 2) pairs of vertices that keep their
+    distance though no edge joins them (a braid stays round); solid: cloth collides with this piece.
     """
 
     name: str
@@ -26,7 +30,10 @@ class Piece:
     faces: Int[np.ndarray, "f 3"]
     uvs: Float[np.ndarray, "f 3 2"]
     weights: Float[np.ndarray, "v j"]
-    lag: Float[np.ndarray, " v"]
+    reach: Float[np.ndarray, " v"] | None = None
+    braces: Int[np.ndarray, "b 2"] | None = None
+    fabric: Fabric = fabrics.COTTON
+    solid: bool = True
 
 
 def grid_faces(rows: int, columns: int, *, closed: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -67,20 +74,6 @@ def outline(points: np.ndarray, centre: np.ndarray, angles: np.ndarray) -> np.nd
     return reach.min(axis=1)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Drape:
-    """How a skirt follows two legs: each of its vertices is skinned twice, to the left and to the right leg.
-
-    left, right (s, j) weights; outward (s, 3) horizontal unit directions away from the body; side (s,) metres to the
-    figure's left. `draping.drape` takes for each vertex the copy that lies further out.
-    """
-
-    left: Float[np.ndarray, "s j"]
-    right: Float[np.ndarray, "s j"]
-    outward: Float[np.ndarray, "s 3"]
-    side: Float[np.ndarray, " s"]
-
-
 def skirt(
     rig: Rig,
     body: Float[np.ndarray, "v 3"],
@@ -89,11 +82,12 @@ def skirt(
     bottom: float,
     flare: float = 0.32,
     margin: float = 0.012,
+    fabric: Fabric = fabrics.DENIM,
     folds: int = 11,
     rows: int = 26,
     columns: int = 66,
-) -> tuple[Piece, Drape]:
-    """A skirt from height `top` to `bottom` around the body vertices (v, 3) (without arms), and how it drapes.
+) -> Piece:
+    """A skirt from height `top` to `bottom` around the body vertices (v, 3) (without arms); its upper rows are sewn on.
 
     `flare` is the outward slope, `margin` the distance from the skin, both in metres (per metre).
     """
@@ -115,17 +109,6 @@ def skirt(
     vertices = points.reshape(-1, 3).astype(np.float32)
     faces, uvs = grid_faces(rows, columns, closed=True)
 
-    outward = np.tile(outward, (rows, 1)).astype(np.float32)
-    hip = rig.heads[rig.index("LeftUpLeg"), 1]
-    on_leg = smoothstep(vertices[:, 1], hip + 0.05, hip - 0.14)
-    # A bent knee swings the calf up behind: the back of the hem gives way to it.
-    on_shin = 0.3 * smoothstep(vertices[:, 1], bottom + 0.16, bottom) * np.clip(-outward[:, 2], 0, 1)
-    sides = []
-    for name in ("Left", "Right"):
-        weights = one_bone(rig, "Hips", len(vertices)) * (1 - on_leg)[:, None]
-        weights[:, rig.index(name + "UpLeg")] = on_leg * (1 - on_shin)
-        weights[:, rig.index(name + "Leg")] = on_leg * on_shin
-        sides.append(weights.astype(np.float32))
-    lag = 0.45 * np.repeat(drop, columns) ** 1.5
-    piece = Piece("skirt", vertices, faces, uvs, (sides[0] + sides[1]) / 2, lag.astype(np.float32))
-    return piece, Drape(sides[0], sides[1], outward, vertices[:, 0].copy())
+    weights = one_bone(rig, "Hips", len(vertices))
+    reach = np.repeat(np.clip(drop - 0.08, 0, None), columns) * (top - bottom) * 1.6
+    return Piece("skirt", vertices, faces, uvs, weights, reach.astype(np.float32), fabric=fabric, solid=False)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from avatarjax.data import body as bodies
-from avatarjax.data import clips, locomotion, skinning
+from avatarjax.data import skinning
+from avatarjax.data.motion import clips, locomotion
 from avatarjax.metrics import responsiveness
 
 DIRECTIONS = {1: (0, 1), 2: (0, -1), 3: (1, 0), 4: (-1, 0)}

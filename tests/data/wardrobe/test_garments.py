@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from avatarjax.data import accessories, garments
+from avatarjax.data.wardrobe import accessories, garments
 from avatarjax.data import body as bodies
 
 

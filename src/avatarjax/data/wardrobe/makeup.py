@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from avatarjax.data.garments import smoothstep
-from avatarjax.data.textures import mix, noise
+from avatarjax.data.wardrobe.garments import smoothstep
+from avatarjax.data.wardrobe.textures import mix, noise
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from avatarjax.data import textures
+from avatarjax.data.wardrobe import textures
 from avatarjax.data.mesh_renderer import sample_texture
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)

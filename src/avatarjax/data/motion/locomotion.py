@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from avatarjax import rotations
 from avatarjax.data import skinning
 from avatarjax.data.body import Rig
-from avatarjax.data.clips import Clips, sample
+from avatarjax.data.motion.clips import Clips, sample
 from avatarjax.physics import springs
 
 

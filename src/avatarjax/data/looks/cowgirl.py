@@ -7,10 +7,10 @@ import dataclasses
 
 import numpy as np
 
-from avatarjax.data import accessories, garments, makeup, wardrobe
 from avatarjax.data.body import load_body, shape
-from avatarjax.data.garments import smoothstep
-from avatarjax.data.textures import mix, noise
+from avatarjax.data.wardrobe import accessories, assembly, garments, makeup
+from avatarjax.data.wardrobe.garments import smoothstep
+from avatarjax.data.wardrobe.textures import mix, noise
 
 _MACRO = {"caucasian-female-young": 1.0, "universal-female-young-averagemuscle-minweight": 0.25}
 _SHIRT = np.array([240.0, 229.0, 208.0])
@@ -81,12 +81,12 @@ class _Cut:
         return smoothstep(y - line, -0.006, 0.006) * (1 - ear) * (y > -0.08)
 
 
-def look() -> wardrobe.Look:
+def look() -> assembly.AvatarMesh:
     """Shape, dress and paint her; about two seconds."""
     body = load_body()
     bare, rig = shape(body, _MACRO)
     joint = {name: rig.heads[rig.index(name)].astype(np.float64) for name in rig.names}
-    eye = wardrobe.body_piece(body, bare, ("helper-l-eye",), "eye").vertices
+    eye = assembly.body_piece(body, bare, ("helper-l-eye",), "eye").vertices
     face = makeup.Face(
         eye=eye.mean(0),
         radius=float(np.ptp(eye[:, 1]) / 2),
@@ -107,11 +107,11 @@ def look() -> wardrobe.Look:
     knee = float(joint["LeftLeg"][1])
     boot_top = 0.72 * knee
 
-    whole = wardrobe.body_piece(body, bare, ("body",), "body")
-    skin = wardrobe.body_piece(body, bare, ("body",), "body", keep=bare[:, 1] > boot_top - 0.03)
+    whole = assembly.body_piece(body, bare, ("body",), "body")
+    skin = assembly.body_piece(body, bare, ("body",), "body", keep=bare[:, 1] > boot_top - 0.03)
     skin = _thicken(skin, cut)
-    normals = wardrobe.vertex_normals(skin.vertices, skin.faces)
-    eyes = wardrobe.body_piece(body, bare, ("helper-l-eye", "helper-r-eye"), "eyes")
+    normals = assembly.vertex_normals(skin.vertices, skin.faces)
+    eyes = assembly.body_piece(body, bare, ("helper-l-eye", "helper-r-eye"), "eyes")
     head = skin.vertices[skin.weights[:, rig.index("Head")] > 0.6]
     boots = [accessories.boot(rig, s, whole.vertices, whole.weights, top=boot_top) for s in ("Left", "Right")]
     hat = accessories.hat(rig, head, base=float(face.eye[1]) + 0.058)
@@ -127,19 +127,19 @@ def look() -> wardrobe.Look:
     )
     arms = [rig.index(n) for n in rig.names if "Arm" in n or "Hand" in n or "Shoulder" in n]
     trunk = skin.vertices[skin.weights[:, arms].sum(1) < 0.3]
-    skirt, drape = garments.skirt(rig, trunk, top=cut.waist, bottom=knee + 0.02, flare=0.3)
+    skirt = garments.skirt(rig, trunk, top=cut.waist, bottom=knee + 0.02, flare=0.3)
 
     layers = [
-        wardrobe.Layer(skin, (0.0, 0.0, 0.74, 0.74), lambda p, n, uv: _paint_body(cut, p)),
-        wardrobe.Layer(hair, (0.74, 0.0, 1.0, 0.36), _paint_hair),
-        wardrobe.Layer(_spread_eyes(eyes), (0.88, 0.74, 1.0, 0.86), lambda p, n, uv: makeup.paint_eyes(face, p)),
-        wardrobe.Layer(hat, (0.74, 0.36, 1.0, 0.74), _paint_hat),
-        wardrobe.Layer(boots[0], (0.6, 0.74, 0.74, 1.0), _paint_boot),
-        wardrobe.Layer(boots[1], (0.74, 0.74, 0.88, 1.0), _paint_boot),
-        wardrobe.Layer(skirt, (0.0, 0.74, 0.6, 1.0), _paint_skirt),
+        assembly.Layer(skin, (0.0, 0.0, 0.74, 0.74), lambda p, n, uv: _paint_body(cut, p)),
+        assembly.Layer(hair, (0.74, 0.0, 1.0, 0.36), _paint_hair),
+        assembly.Layer(_spread_eyes(eyes), (0.88, 0.74, 1.0, 0.86), lambda p, n, uv: makeup.paint_eyes(face, p)),
+        assembly.Layer(hat, (0.74, 0.36, 1.0, 0.74), _paint_hat),
+        assembly.Layer(boots[0], (0.6, 0.74, 0.74, 1.0), _paint_boot),
+        assembly.Layer(boots[1], (0.74, 0.74, 0.88, 1.0), _paint_boot),
+        assembly.Layer(skirt, (0.0, 0.74, 0.6, 1.0), _paint_skirt),
     ]
     soles = rig.soles - np.array([0, _SOLE, 0], np.float32)
-    return wardrobe.assemble(rig.replace(soles=soles), layers, drape)
+    return assembly.assemble("cowgirl", rig.replace(soles=soles), layers)
 
 
 def _thicken(skin: garments.Piece, cut: _Cut) -> garments.Piece:
@@ -147,8 +147,8 @@ def _thicken(skin: garments.Piece, cut: _Cut) -> garments.Piece:
     hair."""
     p = skin.vertices.astype(np.float64)
     dressed, scalp = cut.torso(p), cut.scalp(p)
-    smooth = wardrobe.relax(skin.vertices, skin.faces, (0.6 * dressed + 0.3 * scalp).astype(np.float32), 12)
-    normals = wardrobe.vertex_normals(smooth, skin.faces)
+    smooth = assembly.relax(skin.vertices, skin.faces, (0.6 * dressed + 0.3 * scalp).astype(np.float32), 12)
+    normals = assembly.vertex_normals(smooth, skin.faces)
     thick = 0.006 * dressed + 0.005 * cut.vest(p) + 0.008 * cut.bandana(p) + 0.011 * scalp
     return dataclasses.replace(skin, vertices=(smooth + normals * thick[:, None]).astype(np.float32))
 

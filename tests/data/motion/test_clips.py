@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from avatarjax.data import body as bodies
-from avatarjax.data import clips, retargeting
+from avatarjax.data.motion import clips, retargeting
 
 
 @pytest.fixture(scope="module")

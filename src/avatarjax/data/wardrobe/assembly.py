@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy import sparse
 
-from avatarjax.data import textures
 from avatarjax.data.body import Body, Rig
-from avatarjax.data.garments import Drape, Piece
+from avatarjax.data.wardrobe import textures
+from avatarjax.data.wardrobe.garments import Piece
+from avatarjax.physics.cloth import Fabric
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -23,9 +24,15 @@ class Layer:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Look:
-    """A dressed, painted figure: the arrays of an `AvatarMesh`. The vertices of `drape`, if any, are the last."""
+class AvatarMesh:
+    """A dressed, painted figure in its rest pose as NumPy arrays, metres; the same vertices and faces in every frame.
 
+    vertices (v, 3); faces (f, 3); uvs (f, 3, 2) of each triangle's corners, v up; texture (h, w, 3) sRGB; parts (f,)
+    index into part_names; weights (v, j), rows sum to 1; reach (v,), braces (b, 2): see `Piece`; fabrics and solid, one
+    a part; rig.
+    """
+
+    name: str
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
     uvs: Float[np.ndarray, "f 3 2"]
@@ -33,9 +40,11 @@ class Look:
     parts: Int[np.ndarray, " f"]
     part_names: tuple[str, ...]
     weights: Float[np.ndarray, "v j"]
-    lag: Float[np.ndarray, " v"]
+    reach: Float[np.ndarray, " v"]
+    braces: Int[np.ndarray, "b 2"]
+    fabrics: tuple[Fabric, ...]
+    solid: tuple[bool, ...]
     rig: Rig
-    drape: Drape | None
 
 
 def body_piece(
@@ -55,7 +64,6 @@ def body_piece(
         faces.reshape(-1, 3).astype(np.int32),
         uvs,
         body.skin_weights[used],
-        np.zeros(len(used), np.float32),
     )
 
 
@@ -82,8 +90,8 @@ def relax(
     return moved.astype(np.float32)
 
 
-def assemble(rig: Rig, layers: list[Layer], drape: Drape | None, size: int = 1024) -> Look:
-    """One mesh and atlas (size, size) of layers, in their order; the draped layer must be the last."""
+def assemble(name: str, rig: Rig, layers: list[Layer], size: int = 1024) -> AvatarMesh:
+    """One mesh and atlas (size, size) of layers, in their order."""
     starts = np.cumsum([0] + [len(layer.piece.vertices) for layer in layers])
     vertices = np.concatenate([layer.piece.vertices for layer in layers]).astype(np.float32)
     faces = np.concatenate([layer.piece.faces + start for layer, start in zip(layers, starts, strict=False)])
@@ -96,15 +104,22 @@ def assemble(rig: Rig, layers: list[Layer], drape: Drape | None, size: int = 102
     uvs = low + inset + own * (high - low - 2 * inset)
     normals = vertex_normals(vertices, faces)
     painters = [layer.paint for layer in layers]
-    return Look(
+    none = np.zeros((0, 2), np.int32)
+    pieces = [layer.piece for layer in layers]
+    reaches = [np.zeros(len(p.vertices), np.float32) if p.reach is None else p.reach for p in pieces]
+    braces = [none if p.braces is None else p.braces + start for p, start in zip(pieces, starts, strict=False)]
+    return AvatarMesh(
+        name=name,
         vertices=vertices,
         faces=faces.astype(np.int32),
         uvs=uvs,
         texture=textures.paint_atlas(vertices, normals, faces, uvs, own, parts, painters, size),
         parts=parts,
-        part_names=tuple(layer.piece.name for layer in layers),
-        weights=np.concatenate([layer.piece.weights for layer in layers]).astype(np.float32),
-        lag=np.concatenate([layer.piece.lag for layer in layers]).astype(np.float32),
+        part_names=tuple(p.name for p in pieces),
+        weights=np.concatenate([p.weights for p in pieces]).astype(np.float32),
+        reach=np.concatenate(reaches),
+        braces=np.concatenate(braces).astype(np.int32),
+        fabrics=tuple(p.fabric for p in pieces),
+        solid=tuple(p.solid for p in pieces),
         rig=rig,
-        drape=drape,
     )

@@ -7,7 +7,8 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from avatarjax.data.body import Rig
-from avatarjax.data.garments import Piece, grid_faces, one_bone, outline, smoothstep
+from avatarjax.data.wardrobe import fabrics
+from avatarjax.data.wardrobe.garments import Piece, grid_faces, one_bone, outline, smoothstep
 
 _DOWN = np.array([0.0, -1.0, 0.0])
 
@@ -73,7 +74,6 @@ def boot(
         faces,
         uvs,
         nearest_weights(vertices, body, weights),
-        np.zeros(len(vertices), np.float32),
     )
 
 
@@ -127,7 +127,7 @@ def hat(rig: Rig, head: Float[np.ndarray, "v 3"], *, base: float, brim: float = 
     faces, uvs = grid_faces(len(rows), columns, closed=True)
     vertices = points.reshape(-1, 3).astype(np.float32)
     weights = one_bone(rig, "Head", len(vertices))
-    return Piece("hat", vertices, faces, uvs, weights, np.zeros(len(vertices), np.float32))
+    return Piece("hat", vertices, faces, uvs, weights)
 
 
 def long_hair(
@@ -196,4 +196,5 @@ def long_hair(
     weights = one_bone(rig, "Head", len(vertices)) * on_head[:, None]
     weights[:, rig.index("Spine2")] += 1 - on_head
     fall = np.clip((ear - vertices[:, 1]) / (ear - bottom), 0, 1)
-    return Piece("hair", vertices, faces, uvs, weights.astype(np.float32), (0.6 * fall**1.3).astype(np.float32))
+    reach = (0.5 * np.clip(fall - 0.05, 0, None)).astype(np.float32)
+    return Piece("hair", vertices, faces, uvs, weights.astype(np.float32), reach, fabric=fabrics.HAIR, solid=False)

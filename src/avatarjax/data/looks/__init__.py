@@ -1,0 +1,1 @@
+"""One file an avatar: its shape, its clothes and its paint."""

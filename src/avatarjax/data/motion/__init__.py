@@ -1,0 +1,1 @@
+"""Motion: clips, their retargeting, and controllers that turn keys into poses."""
