@@ -18,8 +18,8 @@ from avatarjax.data import body
 from avatarjax.data.motion import clips, retargeting
 from avatarjax.io import weights
 
-# The body and the eyeballs; the other groups are helper geometry for fitting MakeHuman's own clothes.
-GROUPS = ("body", "helper-l-eye", "helper-r-eye")
+# The body, the eyeballs, and MakeHuman's helper geometry for clothes: shells around the whole body and under the waist.
+GROUPS = ("body", "helper-l-eye", "helper-r-eye", "helper-tights", "helper-skirt", "helper-hair")
 TARGETS = (
     "caucasian-female-young",
     "caucasian-male-young",
