@@ -104,7 +104,8 @@ def shape(body: Body, macro: Mapping[str, float]) -> tuple[Float[np.ndarray, "v 
     for name, weight in macro.items():
         vertices += np.float32(weight) * body.targets[name]
         joints += np.float32(weight) * body.target_joints[name]
-    ground = np.array([0.0, vertices[:, 1].min(), 0.0], np.float32)
+    skin = body.faces[body.parts == body.groups.index("body")]
+    ground = np.array([0.0, vertices[skin, 1].min(), 0.0], np.float32)
     vertices, joints = vertices - ground, joints - ground
     return vertices, Rig(joints[:, 0], joints[:, 1], _soles(body, vertices), body.names, body.parents)
 
