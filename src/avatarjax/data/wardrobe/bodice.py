@@ -1,0 +1,63 @@
+"""The close-fitting upper part of a robe or dress, cut from the skin: where it ends, and how it stands off the body."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from avatarjax.data.body import Rig
+from avatarjax.data.wardrobe import assembly
+from avatarjax.data.wardrobe.garments import Piece, smoothstep
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bodice:
+    """A bodice from the neck to height `waist`, with sleeves `sleeve` metres long from the shoulder joint.
+
+    shoulder (3,) the left shoulder joint and arm (3,) the direction of the left upper arm; neck the height of the neck
+    joint; dip how far the neckline is below it in front. Metres in the rest pose; left and right are alike.
+    """
+
+    shoulder: Float[np.ndarray, "3"]
+    arm: Float[np.ndarray, "3"]
+    neck: float
+    waist: float
+    sleeve: float
+    dip: float = 0.03
+
+    def along(self, p: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Metres from the shoulder joint along the upper arm, on the arm; minus one elsewhere."""
+        x = np.abs(p[:, 0])
+        along = (np.stack([x, p[:, 1], p[:, 2]], axis=1) - self.shoulder) @ self.arm
+        return np.where(x > self.shoulder[0] - 0.01 + 0.35 * np.clip(self.shoulder[1] - p[:, 1], 0, None), along, -1.0)
+
+    def collar(self, p: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Metres above the neckline, which is lower in front than behind and runs over the shoulders."""
+        level = self.neck - 0.008 - self.dip * smoothstep(p[:, 2], -0.02, 0.07)
+        return p[:, 1] - level - 0.8 * np.clip(np.abs(p[:, 0]) - 0.055, 0, None)
+
+    def covered(self, p: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """1 where the bodice is, 0 on bare skin."""
+        along = self.along(p)
+        inside = smoothstep(self.collar(p), 0.003, -0.003) * smoothstep(along, self.sleeve + 0.005, self.sleeve - 0.005)
+        return inside * np.where(along > -0.5, 1.0, smoothstep(p[:, 1], self.waist - 0.06, self.waist - 0.05))
+
+
+def fit(rig: Rig, *, waist: float, sleeve: float, dip: float = 0.03) -> Bodice:
+    """The bodice for a skeleton; lengths in metres."""
+    joint = rig.heads.astype(np.float64)
+    shoulder, elbow = joint[rig.index("LeftArm")], joint[rig.index("LeftForeArm")]
+    arm = (elbow - shoulder) / np.linalg.norm(elbow - shoulder)
+    return Bodice(shoulder, arm, float(joint[rig.index("Neck"), 1]), waist, sleeve, dip)
+
+
+def put_on(
+    skin: Piece, loose: Float[np.ndarray, " v"], thick: Float[np.ndarray, " v"], rounds: int = 24
+) -> tuple[Piece, Float[np.ndarray, "v 3"]]:
+    """The skin as a garment: smoothed by `loose` (v,) in [0, 1] and `thick` (v,) metres outside; and its normals."""
+    smooth = assembly.relax(skin.vertices, skin.faces, loose.astype(np.float32), rounds)
+    normals = assembly.vertex_normals(smooth, skin.faces)
+    vertices = (smooth + normals * thick[:, None]).astype(np.float32)
+    return dataclasses.replace(skin, vertices=vertices), assembly.vertex_normals(vertices, skin.faces)
