@@ -68,11 +68,12 @@ def boot(
     points[..., 1] = np.maximum(points[..., 1], -0.012)
     faces, uvs = grid_faces(len(rings), columns, closed=True)
     vertices = points.reshape(-1, 3).astype(np.float32)
+    # Columns run from behind to the side, so the other way round than the grid takes them to.
     return Piece(
         side.lower() + " boot",
         vertices,
-        faces,
-        uvs,
+        faces[:, [0, 2, 1]],
+        uvs[:, [0, 2, 1]],
         nearest_weights(vertices, body, weights),
     )
 

@@ -1,0 +1,196 @@
+"""Beards and braids: tubes of strands that hang from where they grow, braced so that they stay round."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from avatarjax.data.body import Rig
+from avatarjax.data.wardrobe import fabrics
+from avatarjax.data.wardrobe.garments import Piece, grid_faces, one_bone, smoothstep
+from avatarjax.data.wardrobe.tailoring import hold_clear
+from avatarjax.physics.cloth import Fabric
+
+
+def path_through(knots: Float[np.ndarray, "k 3"], count: int) -> Float[np.ndarray, "n 3"]:
+    """`count` points (n, 3) at even distances along a smooth curve through knots (k, 3)."""
+    from scipy.interpolate import CubicSpline
+
+    lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
+    fine = CubicSpline(lengths, knots)(np.linspace(0, lengths[-1], 40 * count))
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])
+    even = np.linspace(0, along[-1], count)
+    return np.stack([np.interp(even, along, fine[:, k]) for k in range(3)], axis=1)
+
+
+def tube(
+    name: str,
+    path: Float[np.ndarray, "n 3"],
+    aside: Float[np.ndarray, "3"],
+    widths: Float[np.ndarray, " n"],
+    depths: Float[np.ndarray, " n"],
+    weights: Float[np.ndarray, "n j"],
+    reach: Float[np.ndarray, " n"],
+    *,
+    columns: int = 10,
+    fabric: Fabric = fabrics.HAIR,
+) -> Piece:
+    """A tube of elliptic rings about a path (n, 3), which should end in small ones.
+
+    The half axes (n,) of the ellipses, metres, lie towards `aside` (3,) and across it and the path. All vertices of a
+    ring have its weights (n, j) and reach (n,); braces join those that are opposite, and rings two apart along the path
+    on four sides, so that the tube keeps its section and resists kinks.
+    """
+    along = np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    # Rings turn about the vertical only, where a section that minimises twist would drift.
+    across = np.cross(along, aside)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    side = np.cross(across, along)
+    angles = np.arange(columns) * 2 * np.pi / columns
+    rings = (
+        path[:, None]
+        + (widths[:, None] * np.sin(angles))[..., None] * side[:, None]
+        + (depths[:, None] * np.cos(angles))[..., None] * across[:, None]
+    )
+    faces, uvs = grid_faces(len(path), columns, closed=True)
+    vertices = rings.reshape(-1, 3)
+    corners = vertices[faces]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if (outward * (corners.mean(1) - np.repeat(path, columns, 0)[faces].mean(1))).sum() < 0:
+        faces, uvs = faces[:, [0, 2, 1]], uvs[:, [0, 2, 1]]
+    index = np.arange(len(vertices)).reshape(len(path), columns)
+    half = columns // 2
+    opposite = np.stack([index[:, :half], index[:, half : 2 * half]], axis=-1).reshape(-1, 2)
+    quarters = np.arange(0, columns, max(columns // 4, 1))[:4]
+    stiff = np.stack([index[:-2, quarters], index[2:, quarters]], axis=-1).reshape(-1, 2)
+    return Piece(
+        name,
+        vertices.astype(np.float32),
+        faces,
+        uvs,
+        np.repeat(weights, columns, axis=0).astype(np.float32),
+        np.repeat(reach, columns).astype(np.float32),
+        np.concatenate([opposite, stiff]).astype(np.int32),
+        fabric,
+        solid=False,
+    )
+
+
+def braid(
+    rig: Rig,
+    name: str,
+    knots: Float[np.ndarray, "k 3"],
+    solids: list[Piece],
+    *,
+    root: str = "Head",
+    width: float = 0.026,
+    plaits: int = 9,
+    sewn: float = 0.06,
+    margin: float = 0.012,
+    rows: int = 44,
+    columns: int = 10,
+) -> Piece:
+    """A braid along knots (k, 3) from the scalp, held clear of solid pieces; it hangs from the bone `root`.
+
+    `width` is its half width and `sewn` the length that does not swing, metres. Its width pulses with the plaits, and
+    it ends in a tie and a tuft.
+    """
+    path = path_through(knots, rows)
+    for _ in range(4):
+        path = hold_clear(path, solids, margin + width, rounds=2)
+        path[1:-1] = (path[:-2] + 2 * path[1:-1] + path[2:]) / 4
+    path = path_through(path, rows)
+    s = np.linspace(0, 1, rows)
+    pulse = 0.86 + 0.14 * np.abs(np.cos(np.pi * plaits * s / 0.86))
+    taper = width * (1 - 0.25 * s) * pulse
+    # The tie is narrow, and the tuft below it opens and closes to a tip.
+    tuft = np.interp(s, [0.86, 0.89, 0.94, 0.98, 1.0], [0.55, 0.6, 0.85, 0.6, 0.25])
+    radius = np.where(s < 0.86, taper, width * 0.75 * tuft) * np.interp(s, [0, 0.04], [0.6, 1])
+    length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+    reach = 1.3 * np.clip(s * length - sewn, 0, None)
+    weights = one_bone(rig, root, rows)
+    return tube(name, path, np.array([1.0, 0, 0]), radius, 0.85 * radius, weights, reach, columns=columns)
+
+
+def paint_braid(
+    uv: Float[np.ndarray, "n 2"], hair: Float[np.ndarray, "3"], tie: Float[np.ndarray, "3"], plaits: int = 9
+) -> Float[np.ndarray, "n 3"]:
+    """Colours (n, 3) in 0..255 of a `braid`: strands cross in chevrons with dark gaps, a `tie` holds the tuft."""
+    from avatarjax.data.wardrobe.textures import mix
+
+    s, turn = 1 - uv[:, 1], uv[:, 0] * 2 * np.pi
+    # Seen from the front or the back, each strand runs down from its edge to the middle.
+    slant = np.abs(np.sin(turn))
+    phase = s / 0.86 * plaits - 0.45 * slant + 0.5 * (np.sin(turn) > 0)
+    place = np.abs(phase % 1 - 0.5) * 2
+    fine = np.sin(40 * phase + 9 * slant) * 0.05 + np.sin(17 * turn + 60 * s) * 0.04
+    colour = hair * (1.06 - 0.34 * smoothstep(place, 0.55, 1.0) + fine)[:, None]
+    colour = mix(colour, hair * 0.5, 0.7 * smoothstep(slant, 0.16, 0.05) * (s < 0.86))
+    tuft = hair * (1.05 + 0.12 * np.sin(23 * turn))[:, None]
+    colour = mix(colour, tuft, smoothstep(s, 0.875, 0.88))
+    return mix(colour, tie, smoothstep(s, 0.845, 0.85) * smoothstep(s, 0.89, 0.885))
+
+
+def full_beard(
+    rig: Rig,
+    skin: Piece,
+    chin: Float[np.ndarray, "3"],
+    *,
+    jaw: float,
+    bottom: float,
+    width: float = 0.07,
+    depth: float = 0.032,
+    margin: float = 0.012,
+    rows: int = 26,
+    columns: int = 24,
+    solids: list[Piece] | None = None,
+) -> Piece:
+    """A long beard that grows from the chin (3,), a point of the `skin`, and hangs before the chest to height `bottom`.
+
+    It starts at height `jaw` under the lower lip, inside the face; `width` and `depth` are its half axes at the chin,
+    metres. Above the chin it is sewn to the head, below it hangs free of the skin and other solids.
+    """
+    front = chin + np.array([0, 0, 0.012])
+    knots = np.array(
+        [
+            [0, jaw, front[2] - 0.045],
+            [0, chin[1], front[2] - 0.012],
+            [0, 0.6 * chin[1] + 0.4 * bottom, front[2] + 0.012],
+            [0, 0.3 * chin[1] + 0.7 * bottom, front[2] + 0.02],
+            [0, bottom, front[2] + 0.02],
+        ]
+    )
+    path = path_through(knots, rows)
+    s = np.linspace(0, 1, rows)
+    wide = width * np.interp(s, [0, 0.2, 0.45, 0.75, 0.93, 1], [0.72, 1.0, 0.98, 0.62, 0.3, 0.1])
+    deep = depth * np.interp(s, [0, 0.2, 0.5, 0.8, 1], [0.8, 1.0, 0.95, 0.6, 0.12])
+    below = path[:, 1] < chin[1] - 0.01
+    others = [skin, *(solids or [])]
+    for _ in range(4):
+        held = hold_clear(path, others, margin + deep, rounds=1)
+        path[below] = path[below] * np.array([1, 1, 0]) + held[below] * np.array([0, 0, 1])
+        path[1:-1] = (path[:-2] + 2 * path[1:-1] + path[2:]) / 4
+    path[:, 0] = 0
+    fall = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    start = np.interp(0.0, chin[1] - 0.015 - path[:, 1], fall)
+    reach = 1.3 * np.clip(fall - start, 0, None)
+    weights = one_bone(rig, "Head", rows)
+    piece = tube("beard", path, np.array([1.0, 0, 0]), wide, deep, weights, reach, columns=columns)
+    points = piece.vertices.astype(np.float64).reshape(rows, columns, 3)
+    # Locks: the surface is ridged along the strands, and the tip is ragged.
+    angle = np.arange(columns) * 2 * np.pi / columns
+    lock = 1 + 0.07 * np.sin(5 * angle + 0.7) * smoothstep(s, 0.15, 0.4)[:, None]
+    centre = points.mean(1, keepdims=True)
+    points = centre + (points - centre) * lock[..., None]
+    return Piece(
+        piece.name,
+        points.reshape(-1, 3).astype(np.float32),
+        piece.faces,
+        piece.uvs,
+        piece.weights,
+        piece.reach,
+        piece.braces,
+        piece.fabric,
+        solid=False,
+    )

@@ -1,0 +1,154 @@
+"""A long open coat: the upper part and sleeves ride on the body like a thick jacket, a collar stands on it, and the
+skirt hangs free from the waist."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from avatarjax.data.body import Rig
+from avatarjax.data.wardrobe import fabrics, tailoring
+from avatarjax.data.wardrobe.accessories import nearest_weights
+from avatarjax.data.wardrobe.garments import Piece, grid_faces, one_bone, outline, smoothstep
+from avatarjax.physics.cloth import Fabric
+
+
+def front_opening(p: Float[np.ndarray, "n 3"], edge: np.ndarray | float, middle: float) -> Float[np.ndarray, " n"]:
+    """Metres (n,) from the open front of a garment, positive on the garment: it ends `edge` metres, () or (n,), to the
+    left and right of the middle, on the side of the body before z = `middle`."""
+    return np.maximum(np.abs(p[:, 0]) - edge, middle - p[:, 2])
+
+
+def sleeve_end(rig: Rig, p: Float[np.ndarray, "n 3"], beyond: float = 0.0) -> Float[np.ndarray, " n"]:
+    """Metres (n,) before the end of a sleeve, which lies `beyond` metres past the wrist; large off the arms."""
+    wrist = rig.heads[rig.index("LeftHand")].astype(np.float64)
+    along = wrist - rig.heads[rig.index("LeftForeArm")]
+    along /= np.linalg.norm(along)
+    mirrored = np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], axis=1)
+    return beyond - (mirrored - wrist) @ along
+
+
+def coat_top(
+    rig: Rig,
+    shell: Piece,
+    *,
+    waist: float,
+    neck: float,
+    edge: tuple[float, float] = (0.07, 0.085),
+    thickness: float = 0.02,
+    fabric: Fabric = fabrics.DENIM,
+) -> Piece:
+    """The upper part of a coat, with sleeves, from a close shell of the whole body.
+
+    It reaches from height `waist` to about `neck`, metres, and is open in front: `edge` are half the widths of the
+    opening at the waist and at the chest. `thickness` is how far it lies outside the shell.
+    """
+    p = shell.vertices.astype(np.float64)
+    rise = (p[:, 1] - waist) / (neck - waist)
+    edges = np.interp(rise, [0, 0.6, 1], [edge[0], edge[1], edge[1] - 0.012])
+    levels = [
+        p[:, 1] - waist,
+        front_opening(p, edges, 0.035),
+        sleeve_end(rig, p, 0.012),
+        neck - p[:, 1] + 0.55 * np.abs(p[:, 0]),
+    ]
+    top = tailoring.clip(shell, np.min(levels, axis=0))
+    q = top.vertices
+    # Sleeves narrow towards the wrist, where they end in a cuff.
+    before = sleeve_end(rig, q.astype(np.float64), 0.012)
+    cuff = smoothstep(before, 0.075, 0.06) * smoothstep(before, -0.02, 0.0)
+    thick = thickness - 0.004 * smoothstep(before, 0.3, 0.1) + 0.005 * cuff
+    top = tailoring.let_out(top, thick, smooth=0.5, rounds=10)
+    return dataclasses.replace(tailoring.spread_uvs(top), name="coat", fabric=fabric)
+
+
+def collar(
+    rig: Rig,
+    under: Float[np.ndarray, "v 3"],
+    coat: Piece,
+    *,
+    base: float,
+    gap: float = 0.75,
+    height: float = 0.05,
+    columns: int = 30,
+) -> Piece:
+    """A folded collar around the neck `under` it (v, 3), which moves with the `coat`.
+
+    At the back it stands at height `base`, to the front it sinks and opens over `gap` radians to either side.
+    """
+    angles = np.linspace(gap, 2 * np.pi - gap, columns)
+    near = under[(np.abs(under[:, 1] - base + 0.005) < 0.018) & (np.abs(under[:, 0]) < 0.075)][:, [0, 2]]
+    centre = (near.min(0) + near.max(0)) / 2
+    radius = outline(near, centre, angles)
+    sunk = 0.045 * smoothstep(np.cos(angles), -0.3, 0.8)
+    profile = [(0.02, -0.012), (0.012, 0.5), (0.012, 0.9), (0.018, 1.05), (0.027, 0.9), (0.037, 0.45), (0.048, -0.02)]
+    rows = []
+    for out, up in profile:
+        r = radius + out * (1 + 0.35 * np.cos(angles)) + 0.004
+        rise = base - sunk + (up * height if up > 0 else up)
+        rows.append(np.stack([centre[0] + r * np.sin(angles), rise, centre[1] + r * np.cos(angles)], axis=1))
+    vertices = np.concatenate(rows).astype(np.float32)
+    faces, uvs = grid_faces(len(rows), columns, closed=False)
+    return Piece("collar", vertices, faces, uvs, nearest_weights(vertices, coat.vertices, coat.weights), solid=False)
+
+
+def coat_skirt(
+    rig: Rig,
+    under: Float[np.ndarray, "v 3"],
+    top: Piece,
+    *,
+    start: float,
+    waist: float,
+    bottom: float,
+    gap: float = 0.48,
+    flare: float = 0.19,
+    margin: float = 0.012,
+    folds: int = 11,
+    fabric: Fabric = fabrics.DENIM,
+    rows: int = 30,
+    columns: int = 84,
+) -> Piece:
+    """The skirt of an open coat around the body and legs `under` it (v, 3), from height `start` to `bottom`, metres.
+
+    It overlaps the coat's `top` down to `waist` and is sewn there. `gap` is half the open angle in front, radians;
+    `flare` metres outwards a metre; `margin` metres from what is under it.
+    """
+    angles = np.linspace(gap, 2 * np.pi - gap, columns)
+    heights = np.concatenate([np.linspace(start, waist, 3)[:-1], np.linspace(waist, bottom, rows - 2)])
+    centre = np.array([0.0, rig.heads[rig.index("Hips"), 2] + 0.012])
+    radius = np.zeros((rows, columns))
+    for i, y in enumerate(heights):
+        slab = under[np.abs(under[:, 1] - y) < 0.03][:, [0, 2]]
+        fitted = outline(slab, centre, angles) + margin
+        fall = heights[i - 1] - y if i else 0.0
+        radius[i] = np.maximum(fitted, radius[i - 1] + flare * fall) if i else fitted
+        if heights[i] > waist - 0.08:
+            radius[i, 1:-1] = (radius[i, :-2] + 2 * radius[i, 1:-1] + radius[i, 2:]) / 4
+    drop = np.clip((waist - heights) / (waist - bottom), 0, 1)
+    phase = folds * (angles - np.pi) + 0.6 * np.sin(2 * angles)
+    radius += 0.03 * drop[:, None] ** 1.3 * (np.cos(phase) + 1 - drop[:, None])[:, :]
+    # It hangs further out behind, as a coat does that is cut to flare.
+    radius *= 1 + 0.1 * drop[:, None] * np.clip(-np.cos(angles), 0, None) ** 2
+    # The front edges do not swing inwards over each other.
+    outward = np.stack([np.sin(angles), np.zeros(columns), np.cos(angles)], axis=1)
+    points = outward[None] * radius[..., None] + np.array([centre[0], 0, centre[1]])
+    points[..., 1] = heights[:, None] - 0.012 * drop[:, None] * np.cos(angles)[None]
+    vertices = points.reshape(-1, 3).astype(np.float32)
+    faces, uvs = grid_faces(rows, columns, closed=False)
+    sewn = np.repeat(smoothstep(drop, 0.15, 0.0), columns)[:, None]
+    weights = sewn * nearest_weights(vertices, top.vertices, top.weights) + (1 - sewn) * one_bone(
+        rig, "Hips", len(vertices)
+    )
+    fall = np.clip(waist - 0.015 - np.repeat(heights, columns), 0, None)
+    return Piece(
+        "coat skirt",
+        vertices,
+        faces,
+        uvs,
+        weights.astype(np.float32),
+        (1.5 * fall).astype(np.float32),
+        fabric=fabric,
+        solid=False,
+    )
