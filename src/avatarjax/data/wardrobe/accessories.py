@@ -192,10 +192,7 @@ def long_hair(
         rows.append(point)
     vertices = np.concatenate(rows).astype(np.float32)
     faces, uvs = grid_faces(len(rows), columns, closed=False)
-    neck = rig.heads[rig.index("Neck"), 1]
-    on_head = smoothstep(vertices[:, 1], neck - 0.05, neck + 0.07)
-    weights = one_bone(rig, "Head", len(vertices)) * on_head[:, None]
-    weights[:, rig.index("Spine2")] += 1 - on_head
+    weights = one_bone(rig, "Head", len(vertices))
     fall = np.clip((ear - vertices[:, 1]) / (ear - bottom), 0, 1)
-    reach = (0.5 * np.clip(fall - 0.05, 0, None)).astype(np.float32)
-    return Piece("hair", vertices, faces, uvs, weights.astype(np.float32), reach, fabric=fabrics.HAIR, solid=False)
+    reach = (1.6 * (ear - bottom) * np.clip(fall - 0.03, 0, None)).astype(np.float32)
+    return Piece("hair", vertices, faces, uvs, weights, reach, fabric=fabrics.HAIR, solid=False)
