@@ -1,0 +1,167 @@
+"""Cloth against solid surfaces and against itself, as planes and spheres found again every few steps.
+
+A solid is known by points with normals on its skin, in a few groups of limbs. The nearest point of each group gives a
+vertex a plane that moves with the skin: any shape that is skinned can be collided with, and a leg that swings past
+another is seen coming. Where the surface is convex the plane lies outside it, which errs on the safe side.
+"""
+
+from __future__ import annotations
+
+import typing
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+# How many points are compared with all vertices at a time: their distances stay in the cache.
+_BLOCK = 16
+# Metres: a plane holds only so far around its point, and a vertex deeper than this is on the other side of a limb.
+_PLANE_RADIUS, _DEEPEST = 0.05, 0.10
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class Surface:
+    """Points (g, m, 3) on solid surfaces in g groups and their unit normals (g, m, 3), pointing out; metres."""
+
+    points: Float[Array, "g m 3"]
+    normals: Float[Array, "g m 3"]
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class Capsules:
+    """Segments from and to (k, 3) with radii (k,), metres: frictionless solids that bridge gaps in a surface."""
+
+    begin: Float[Array, "k 3"]
+    end: Float[Array, "k 3"]
+    radii: Float[Array, " k"]
+
+
+def nearest(
+    queries: Float[Array, "n 3"],
+    points: Float[Array, "m 3"],
+    rest_queries: Float[Array, "n 3"] | None = None,
+    rest_points: Float[Array, "m 3"] | None = None,
+    apart: float = 0.0,
+) -> Int[Array, " n"]:
+    """The index (n,) of the nearest of points (m, 3) for each query (n, 3).
+
+    With `rest_queries` and `rest_points`, only points that are more than `apart` metres away in that other pose count
+    (0 where there are none). All pairs are compared: distances carry the index in their lowest bits, so that the
+    minimum of integers finds both; squared distances are right to one part in 2^(23 - log2 m).
+    """
+    count = points.shape[0]
+    blocks = -(-count // _BLOCK)
+    bits = max(1, (blocks * _BLOCK - 1).bit_length())
+    mask = (1 << bits) - 1
+    far = jnp.pad(points, ((0, blocks * _BLOCK - count), (0, 0)), constant_values=1e6).reshape(blocks, _BLOCK, 3)
+    known = rest_queries is not None and rest_points is not None
+    other = jnp.pad(rest_points, ((0, blocks * _BLOCK - count), (0, 0))).reshape(blocks, _BLOCK, 3) if known else far
+
+    def squares(a: Array, b: Array) -> Array:
+        return sum((a[None, :, k] - b[:, None, k]) ** 2 for k in range(3))
+
+    def block(best: Array, inputs: tuple[Array, Array, Array]) -> tuple[Array, None]:
+        own, rest, start = inputs
+        distance = jax.lax.bitcast_convert_type(squares(queries, own), jnp.int32)
+        packed = (distance & ~mask) | (start + jnp.arange(_BLOCK, dtype=jnp.int32))[:, None]
+        if known:
+            packed = jnp.where(squares(rest_queries, rest) > apart**2, packed, jnp.iinfo(jnp.int32).max & ~mask)
+        return jnp.minimum(best, packed.min(axis=0)), None
+
+    start = jnp.arange(blocks, dtype=jnp.int32) * _BLOCK
+    best, _ = jax.lax.scan(
+        block, jnp.full(queries.shape[0], jnp.iinfo(jnp.int32).max & ~mask, jnp.int32), (far, other, start)
+    )
+    return jnp.minimum(best & mask, count - 1)
+
+
+def find_planes(positions: Float[Array, "n 3"], surface: Surface) -> Int[Array, "g n"]:
+    """The nearest point (g, n) of each group of a surface for each vertex (n, 3)."""
+    return jnp.stack([nearest(positions, points) for points in surface.points])
+
+
+def take_planes(surface: Surface, planes: Int[Array, "g n"]) -> Surface:
+    """The points and normals (g, n, 3) that `find_planes` found."""
+    group = jnp.arange(planes.shape[0])[:, None]
+    return Surface(surface.points[group, planes], surface.normals[group, planes])
+
+
+def push_out(
+    positions: Float[Array, "n 3"],
+    previous: Float[Array, "n 3"],
+    planes: Surface,
+    moved: Float[Array, "g n 3"],
+    clearance: Float[Array, " n"],
+    friction: Float[Array, " n"],
+) -> Float[Array, "n 3"]:
+    """Positions (n, 3) moved out of the half-spaces behind the planes of each group, one group after the other.
+
+    `previous` (n, 3) are the positions before the step and `moved` (g, n, 3) how far the surface went in it: friction
+    takes away up to the vertex's share of the slip between them (Coulomb, at the level of positions).
+    """
+    slip_from = previous
+    for point, normal, carried in zip(planes.points, planes.normals, moved, strict=True):
+        offset = positions - point
+        height = jnp.sum(offset * normal, axis=1)
+        aside = jnp.sum(offset * offset, axis=1) - height * height
+        held = (aside < _PLANE_RADIUS**2) & (height > -_DEEPEST)
+        depth = jnp.where(held, jnp.maximum(clearance - height, 0), 0.0)
+        slip = positions - slip_from - carried
+        slip = slip - jnp.sum(slip * normal, axis=1, keepdims=True) * normal
+        length = jnp.sqrt(jnp.sum(slip * slip, axis=1) + 1e-18)
+        kept = jnp.minimum(friction * depth / length, 1.0)
+        positions = positions + depth[:, None] * normal - kept[:, None] * slip
+    return positions
+
+
+def push_out_of_capsules(positions: Float[Array, "n 3"], capsules: Capsules) -> Float[Array, "n 3"]:
+    """Positions (n, 3) moved out of capsules, one after the other."""
+    for begin, end, radius in zip(capsules.begin, capsules.end, capsules.radii, strict=True):
+        axis = end - begin
+        offset = positions - begin[None]
+        share = jnp.clip((offset @ axis) / (axis @ axis + 1e-12), 0, 1)
+        away = offset - share[:, None] * axis[None]
+        length = jnp.sqrt(jnp.sum(away * away, axis=1) + 1e-18)
+        positions = positions + (jnp.maximum(radius - length, 0) / length)[:, None] * away
+    return positions
+
+
+def find_neighbours(
+    positions: Float[Array, "n 3"], rest: Float[Array, "n 3"], apart: float, count: int
+) -> Int[Array, "k n"]:
+    """For each vertex `count` others that are near now and were more than `apart` metres away in the pattern.
+
+    The vertices are dealt out to `count` hands, and each hand gives its nearest.
+    """
+    found = []
+    for hand in range(count):
+        mine = nearest(positions, positions[hand::count], rest, rest[hand::count], apart)
+        found.append(mine * count + hand)
+    return jnp.minimum(jnp.stack(found), positions.shape[0] - 1)
+
+
+def separate(
+    positions: Float[Array, "n 3"],
+    neighbours: Int[Array, "k n"],
+    rest: Float[Array, "n 3"],
+    free: Float[Array, " n"],
+    distance: float,
+) -> Float[Array, "n 3"]:
+    """Positions (n, 3) moved away from `neighbours` that are nearer than `distance` metres, but not in the pattern.
+
+    Each of the two goes half the way (each computes its own half), all of it where the other is sewn on (`free` 0).
+    """
+    total = jnp.zeros_like(positions)
+    touching = jnp.zeros(positions.shape[0])
+    for other in neighbours:
+        offset = positions - positions[other]
+        length = jnp.sqrt(jnp.sum(offset * offset, axis=1) + 1e-18)
+        between = jnp.sum((rest - rest[other]) ** 2, axis=1)
+        lacking = jnp.where(between > distance**2, jnp.maximum(distance - length, 0), 0.0)
+        share = lacking * free / jnp.maximum(free + free[other], 1e-9)
+        total = total + (share / length)[:, None] * offset
+        touching = touching + (lacking > 0)
+    return positions + total / jnp.maximum(touching, 1)[:, None]
