@@ -22,6 +22,7 @@ from avatarjax.data.wardrobe import (
 )
 from avatarjax.data.wardrobe.garments import outline, smoothstep
 from avatarjax.data.wardrobe.textures import mix, noise
+from avatarjax.data.wardrobe.weave import woven
 
 _MACRO = {"caucasian-male-old": 1.0, "universal-male-old-minmuscle-minweight": 0.35}
 _HABIT = np.array([182.0, 134.0, 90.0])
@@ -51,11 +52,11 @@ class _Cut:
         """1 on the short beard: chin, jaw and upper lip, not the lips."""
         x, y = np.abs(p[:, 0]), p[:, 1] - self.face.eye[1]
         back = self.face.eye[2] - p[:, 2]
-        line = -0.083 + 0.9 * np.clip(x - 0.022, 0, 0.05) + 0.25 * np.clip(back - 0.01, 0, None)
-        chin = smoothstep(y - line, 0.004, -0.004) * smoothstep(back, 0.088, 0.07)
+        line = -0.0775 + 0.9 * np.clip(x - 0.022, 0, 0.05) + 0.25 * np.clip(back - 0.01, 0, None)
+        chin = smoothstep(y - line, 0.004, -0.004) * smoothstep(back, 0.076, 0.062)
         throat = smoothstep(y, -0.142, -0.128)
-        upper = makeup.blob((x - 0.006) / 0.032, (y + 0.0565 + 0.35 * np.clip(x - 0.012, 0, None)) / 0.0075, 0.6)
-        corner = makeup.blob((x - 0.031) / 0.008, (y + 0.076) / 0.018, 0.5)
+        upper = makeup.blob((x - 0.006) / 0.032, (y + 0.051 + 0.35 * np.clip(x - 0.012, 0, None)) / 0.0075, 0.6)
+        corner = makeup.blob((x - 0.031) / 0.008, (y + 0.0705) / 0.018, 0.5)
         return np.maximum(chin * throat, np.maximum(upper, corner) * (p[:, 2] > self.face.eye[2] - 0.02))
 
 
@@ -66,22 +67,24 @@ def look() -> assembly.AvatarMesh:
     eyes = assembly.body_piece(body, bare, ("helper-l-eye", "helper-r-eye"), "eyes")
     eye = eyes.vertices[eyes.vertices[:, 0] > 0]
     face = makeup.Face(
-        eye=eye.mean(0),
+        # His lids hang, and his mouth is low.
+        eye=eye.mean(0) - np.array([0, 0.0055, 0], np.float32),
         radius=float(np.ptp(eye[:, 1]) / 2),
         skin=np.array([226.0, 176.0, 146.0]),
         brow=_WHITE,
         lips=np.array([178.0, 112.0, 100.0]),
         iris=np.array([92.0, 112.0, 128.0]),
+        aperture=0.62,
     )
     waist = float(rig.heads[rig.index("Spine"), 1]) + 0.01
-    cut = _Cut(face, bodice.fit(rig, waist=waist, sleeve=0.15, dip=0.035))
+    cut = _Cut(face, bodice.fit(rig, waist=waist, sleeve=0.12, dip=0.035))
 
-    skin = assembly.body_piece(body, bare, ("body",), "body")
+    skin = bodice.visible_skin(body, bare)
     p = skin.vertices.astype(np.float64)
     dressed, beard = cut.bodice.covered(p), cut.beard(p)
     # The habit is wide: it is bloused over the belt.
-    blouse = 0.012 * np.exp(-(((p[:, 1] - waist - 0.05) / 0.05) ** 2))
-    thick = (0.013 + blouse) * dressed + 0.006 * cut.cape(p) + 0.007 * beard
+    blouse = 0.02 * np.exp(-(((p[:, 1] - waist - 0.07) / 0.06) ** 2))
+    thick = (0.002 + 0.011 * cut.bodice.taper(p) + blouse) * dressed + 0.006 * cut.cape(p) + 0.007 * beard
     chin = (
         beard * smoothstep(p[:, 1], face.eye[1] - 0.085, face.eye[1] - 0.115) * smoothstep(np.abs(p[:, 0]), 0.06, 0.0)
     )
@@ -95,23 +98,25 @@ def look() -> assembly.AvatarMesh:
     centre = np.array([0.0, float(rig.heads[rig.index("Hips"), 2])])
     radius = outline(girdle, centre, angles) + 0.6 * _ROPE_RADIUS
     around = np.stack([radius * np.sin(angles), np.full(72, waist), radius * np.cos(angles) + centre[1]], axis=1)
-    belt = cords.rope_belt(around, trunk, skin.weights[skin.weights[:, arms].sum(1) < 0.5], radius=_ROPE_RADIUS)
+    belt = cords.rope_belt(
+        around, trunk, skin.weights[skin.weights[:, arms].sum(1) < 0.5], radius=_ROPE_RADIUS, rows=72, columns=6
+    )
     skirt = robes.long_skirt(rig, trunk, top=waist, bottom=0.075, depth=0.06, rows=40, columns=80)
     skirt = _above(skirt, 0.1)
     for x, length in ((0.035, 0.46), (0.062, 0.56)):
         skirt = _rope_end(skirt, x, waist, length)
     sleeves = [
-        robes.sleeve_bell(rig, s, skin.vertices, skin.weights, start=0.09, drop=0.21, rows=24, columns=36)
+        robes.sleeve_bell(rig, s, lie_on, skin.weights, start=0.075, drop=0.21, rows=24, columns=36)
         for s in ("Left", "Right")
     ]
-    hood = hoods.hood(rig, lie_on, skin.weights, collar=cut.bodice.neck - 0.012, rows=26, columns=48)
+    hood = hoods.hood(rig, lie_on, skin.weights, collar=cut.bodice.neck - 0.012, rows=26, columns=42)
     string = cords.necklace(rig, lie_on, collar=cut.bodice.neck + 0.004, radius=0.014, depth=0.27)
-    beads = cords.beads(string, skin.vertices, skin.weights, rows=5, columns=7)
+    beads = cords.beads(string, skin.vertices, skin.weights, rows=5, columns=6)
     sandals = [footwear.sandal(rig, s, skin.vertices, skin.weights, thickness=_SOLE) for s in ("Left", "Right")]
 
     layers = [
         assembly.Layer(skin, (0.0, 0.0, 0.7, 0.7), lambda p, n, uv: _paint_body(cut, p)),
-        assembly.Layer(eyes, (0.9, 0.9, 1.0, 1.0), lambda p, n, uv: makeup.paint_eyes(face, p)),
+        assembly.Layer(assembly.spread_uvs(eyes), (0.9, 0.9, 1.0, 1.0), lambda p, n, uv: makeup.paint_eyes(face, p)),
         assembly.Layer(skirt, (0.0, 0.7, 0.7, 1.0), lambda p, n, uv: _paint_skirt(p, n, uv)),
         assembly.Layer(sleeves[0], (0.7, 0.0, 0.85, 0.3), lambda p, n, uv: _paint_sleeve(p, uv)),
         assembly.Layer(sleeves[1], (0.85, 0.0, 1.0, 0.3), lambda p, n, uv: _paint_sleeve(p, uv)),
@@ -141,24 +146,13 @@ def _rope_end(skirt: garments.Piece, x: float, waist: float, length: float) -> g
     return cords.hang_rope(skirt, path, strip=(0.0, low, 1.0, low + 0.048))
 
 
-def _cloth(colour: np.ndarray, p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Coarse wool: uneven threads both ways (`uv` in metres), uneven dye, and darker flanks of folds."""
-    flat = np.concatenate([uv, np.zeros((len(uv), 1))], axis=1)
-    threads = 0.05 * noise(flat * np.array([1, 0.1, 1]), 0.005, 3) + 0.05 * noise(
-        flat * np.array([0.1, 1, 1]), 0.005, 2
-    )
-    out = p * np.array([1.0, 0, 1.0])
-    facing = (n * out).sum(1) / np.maximum(np.linalg.norm(out, axis=1) * np.linalg.norm(n[:, [0, 2]], axis=1), 1e-6)
-    return colour * (1 + threads + 0.06 * noise(p, 0.06, 4) - 0.22 * (1 - np.clip(facing, 0, 1)))[:, None]
-
-
 def _paint_body(cut: _Cut, p: np.ndarray) -> np.ndarray:
     face = cut.face
     colour = complexion.age(face, p, makeup.paint_skin(face, p))
     x, y = np.abs(p[:, 0]), p[:, 1] - face.eye[1]
     front = p[:, 2] > face.eye[2] - 0.03
     # Bushy brows, over the painted ones.
-    bush = makeup.blob((x - face.eye[0] - 0.003) / 0.027, (y - 0.0205 + 0.12 * np.abs(x - 0.03)) / 0.0058, 0.5)
+    bush = makeup.blob((x - face.eye[0] - 0.003) / 0.027, (y - 0.024 + 0.12 * np.abs(x - 0.03)) / 0.0058, 0.5)
     colour = mix(colour, _WHITE * (0.95 + 0.12 * noise(p * np.array([1, 0.4, 1]), 0.003, 5))[:, None], front * bush)
     # The shaven crown: a cooler shade where hair would grow.
     scalp = smoothstep(y - 0.075 + 1.2 * np.clip(face.eye[2] - p[:, 2] - 0.03, 0, None), 0.0, 0.04) * (y > -0.06)
@@ -167,10 +161,10 @@ def _paint_body(cut: _Cut, p: np.ndarray) -> np.ndarray:
     colour = mix(colour, grey, 0.3 * scalp * stubble * (1 - smoothstep(y, 0.05, 0.09)))
     hairs = noise(p * np.array([1, 0.22, 1]), 0.0035, 7)
     colour = mix(colour, _WHITE * (0.93 + 0.13 * hairs)[:, None], 0.95 * cut.beard(p))
-    wool = _cloth(_HABIT, p, p, p[:, :2])
+    wool = woven(_HABIT, p, None, p[:, :2])
     wool = wool * (1 + 0.06 * np.cos(p[:, 0] / 0.028 + 3 * noise(p, 0.09, 8)))[:, None]
     colour = mix(colour, wool, cut.bodice.covered(p))
-    cape = _cloth(_CAPE, p, p, p[:, :2])
+    cape = woven(_CAPE, p, None, p[:, :2])
     mask = cut.cape(p)
     inner = cut.cape(p + np.array([0, -0.011, 0]) + np.sign(p) * np.array([0.007, 0, 0]))
     cape = mix(cape, _CAPE * 0.7, 0.7 * (1 - inner))
@@ -179,7 +173,7 @@ def _paint_body(cut: _Cut, p: np.ndarray) -> np.ndarray:
 
 def _paint_skirt(p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:
     v = (uv[:, 1] - 0.1) / 0.9
-    colour = _cloth(_HABIT, p, n, np.stack([uv[:, 0] * 1.9, v * 0.96], axis=1))
+    colour = woven(_HABIT, p, n, np.stack([uv[:, 0] * 1.9, v * 0.96], axis=1))
     hem = smoothstep(np.abs(v - 0.035), 0.004, 0.002)
     colour = mix(colour, _HABIT * 0.72, 0.6 * hem)
     # Dust of the road.
@@ -190,14 +184,14 @@ def _paint_skirt(p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def _paint_sleeve(p: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    colour = _cloth(_HABIT, p, p, uv * np.array([0.5, 0.45]))
+    colour = woven(_HABIT, p, None, uv * np.array([0.5, 0.45]))
     seam = smoothstep(np.abs(uv[:, 1] - 0.06), 0.008, 0.004)
     colour = mix(colour, _HABIT * 0.72, 0.6 * seam)
     return mix(colour, _HABIT * 0.8, 0.5 * smoothstep(uv[:, 1], 0.06, 0.05))
 
 
 def _paint_hood(p: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    colour = _cloth(_CAPE, p, p, uv * np.array([0.5, 0.4]))
+    colour = woven(_CAPE, p, None, uv * np.array([0.5, 0.4]))
     colour = mix(colour, _CAPE * 0.72, 0.6 * smoothstep(np.abs(uv[:, 0] - 0.5), 0.006, 0.003))
     return mix(colour, _CAPE * 0.72, 0.5 * smoothstep(np.abs(uv[:, 1] - 0.05), 0.008, 0.004))
 

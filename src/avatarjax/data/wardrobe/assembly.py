@@ -90,6 +90,12 @@ def relax(
     return moved.astype(np.float32)
 
 
+def spread_uvs(piece: Piece) -> Piece:
+    """The piece with its uvs, a corner of the body's square, spread over the whole unit square."""
+    low, high = piece.uvs.min(axis=(0, 1)), piece.uvs.max(axis=(0, 1))
+    return dataclasses.replace(piece, uvs=((piece.uvs - low) / (high - low)).astype(np.float32))
+
+
 def assemble(name: str, rig: Rig, layers: list[Layer], size: int = 1024) -> AvatarMesh:
     """One mesh and atlas (size, size) of layers, in their order."""
     starts = np.cumsum([0] + [len(layer.piece.vertices) for layer in layers])

@@ -7,9 +7,11 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from avatarjax.data.body import Rig
-from avatarjax.data.wardrobe import assembly
+from avatarjax.data.body import Body, Rig
+from avatarjax.data.wardrobe import assembly, visibility
 from avatarjax.data.wardrobe.garments import Piece, smoothstep
+
+_SKIN = ("body", "helper-l-eye", "helper-r-eye")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,6 +35,10 @@ class Bodice:
         along = (np.stack([x, p[:, 1], p[:, 2]], axis=1) - self.shoulder) @ self.arm
         return np.where(x > self.shoulder[0] - 0.01 + 0.35 * np.clip(self.shoulder[1] - p[:, 1], 0, None), along, -1.0)
 
+    def taper(self, p: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """1 on the trunk, 0 where the sleeves end: how thick cloth is that goes on as a separate sleeve."""
+        return smoothstep(self.along(p), self.sleeve, self.sleeve - 0.09)
+
     def collar(self, p: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Metres above the neckline, which is lower in front than behind and runs over the shoulders."""
         level = self.neck - 0.008 - self.dip * smoothstep(p[:, 2], -0.02, 0.07)
@@ -51,6 +57,19 @@ def fit(rig: Rig, *, waist: float, sleeve: float, dip: float = 0.03) -> Bodice:
     shoulder, elbow = joint[rig.index("LeftArm")], joint[rig.index("LeftForeArm")]
     arm = (elbow - shoulder) / np.linalg.norm(elbow - shoulder)
     return Bodice(shoulder, arm, float(joint[rig.index("Neck"), 1]), waist, sleeve, dip)
+
+
+def visible_skin(body: Body, bare: Float[np.ndarray, "v 3"]) -> Piece:
+    """The skin of the shaped body (v, 3) without what nobody can see."""
+    whole = assembly.body_piece(body, bare, _SKIN, "body")
+    shown = visibility.seen(whole.vertices, whole.faces, assembly.vertex_normals(whole.vertices, whole.faces))
+    # Faces go only where all of their surroundings are hidden.
+    near = np.zeros_like(shown)
+    near[whole.faces[shown[whole.faces].any(axis=1)]] = True
+    keep = np.zeros(len(bare), bool)
+    used = np.unique(body.faces[np.isin(body.parts, [body.groups.index(g) for g in _SKIN])])
+    keep[used] = near
+    return assembly.body_piece(body, bare, ("body",), "body", keep=keep)
 
 
 def put_on(

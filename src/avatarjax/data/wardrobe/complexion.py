@@ -26,7 +26,7 @@ def age(
     bend = 0.006 * np.cos(x / 0.03 * 1.6)
     for level, width in ((0.040, 0.045), (0.051, 0.048), (0.062, 0.04)):
         line = blob(x / width, (y - level - bend) / 0.0017, 0.3)
-        colour = mix(colour, dark, 0.5 * amount * front * line)
+        colour = mix(colour, dark, 0.4 * amount * front * line)
     # Lines fan out from the outer corner of the eye.
     for slope, length in ((0.45, 0.014), (0.0, 0.017), (-0.5, 0.014)):
         along = x - face.eye[0] - 0.024
@@ -36,9 +36,16 @@ def age(
     colour = mix(colour, dark, 0.5 * amount * front * bag)
     fold = x - 0.019 - 0.75 * np.clip(-y - 0.036, 0, None)
     colour = mix(
-        colour, dark, 0.55 * amount * front * blob(fold / 0.0028, (y + 0.053) / 0.023, 0.2) * (p[:, 2] > face.eye[2])
+        colour, dark, 0.35 * amount * front * blob(fold / 0.0028, (y + 0.053) / 0.023, 0.2) * (p[:, 2] > face.eye[2])
     )
-    spots = smoothstep(noise(p, 0.011, 21), 0.62, 0.8) * smoothstep(y, 0.03, 0.06)
+    # Spots of sizes from a lentil to a thumbnail, all over the scalp.
+    random = np.random.default_rng(21)
+    centre, spots = face.eye * np.array([0, 1, 1]) + np.array([0, 0.03, -0.085]), np.zeros(len(p))
+    way = (p - centre) / np.maximum(np.linalg.norm(p - centre, axis=1, keepdims=True), 1e-6)
+    for spot, size in zip(random.normal([0, 1.1, 0], size=(22, 3)), random.uniform(0.025, 0.075, 22), strict=True):
+        away = np.linalg.norm(way - spot / np.linalg.norm(spot), axis=1) * (1 + 0.25 * noise(p, 0.006, 22))
+        spots = np.maximum(spots, smoothstep(away / size, 1.0, 0.5))
+    spots = spots * smoothstep(y, 0.045, 0.07)
     return mix(colour, face.skin * np.array([0.78, 0.66, 0.58]), 0.45 * amount * spots)
 
 
@@ -48,7 +55,7 @@ def sockets(
     """Colours (n, 3) with eye sockets and hollow cheeks of a shade (3,) under what is painted on the lids."""
     x, y, front = _place(face, p)
     ex = x - face.eye[0]
-    lid = blob(ex / 0.0175, (y - 0.002) / 0.0095, 0.8)
+    lid = blob(ex / 0.0175, (y - 0.002) / (0.0095 * face.aperture), 0.8)
     ring = blob(ex / 0.031, (y + 0.003) / 0.025, 0.15) * (1 - lid)
     colour = mix(colour, shade, 0.75 * front * ring)
     tear = blob((ex + 0.002) / 0.006, (y + 0.032) / 0.03, 0.0)

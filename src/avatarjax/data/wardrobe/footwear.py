@@ -18,7 +18,7 @@ def sandal(
     *,
     thickness: float = 0.014,
     margin: float = 0.005,
-    columns: int = 28,
+    columns: int = 24,
 ) -> Piece:
     """A sandal (`side` is Left or Right) on the foot of the body (v, 3), whose sole is `thickness` metres below y = 0.
 

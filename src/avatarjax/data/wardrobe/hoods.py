@@ -59,7 +59,7 @@ def hood(
     def pull(p: np.ndarray, gone: np.ndarray) -> np.ndarray:
         # A hood hangs to a point: its sides are drawn in to the middle of the back.
         inward = -p[:, :1] * np.array([1.0, 0, 0]) * (2.0 * behind * smoothstep(gone, 0.02, 0.2))[:, None]
-        away = out * (0.55 * np.exp(-gone / 0.04) + 0.05)[:, None]
+        away = out * ((0.2 + 0.35 * behind) * np.exp(-gone / 0.04) + 0.05)[:, None]
         return away - _UP + inward
 
     below = drape.fall(rise[-1], lengths, rows - 8, lie_on, pull=pull, gap=0.013, ease=1, smooth=0.35)
@@ -91,7 +91,7 @@ def veil(
     centre: Float[np.ndarray, "3"],
     *,
     length: float,
-    tilt: float = 0.35,
+    tilt: float = 0.2,
     spread: float = 1.75,
     gap: float = 0.014,
     tatter: float = 0.1,
@@ -112,7 +112,7 @@ def veil(
     lengths = length - 0.5 * np.abs(centre[1] + 0.12 - band[:, 1]) + tatter * length * (torn - 0.3)
 
     def pull(p: np.ndarray, gone: np.ndarray) -> np.ndarray:
-        back = 1.1 * np.exp(-gone / 0.12) + 0.05
+        back = 0.5 * np.exp(-gone / 0.06) + 0.02
         # It spreads as it falls, in soft folds.
         side = 0.9 * np.sin(turn) * smoothstep(gone, 0.1, 0.3) * np.exp(-gone / 0.5)
         return np.stack([side * 0.35, -np.ones(columns), -back], axis=1)
@@ -147,8 +147,8 @@ def front_hair(
     temple: float,
     gap: float = 0.012,
     fabric: Fabric = fabrics.HAIR,
-    rows: int = 44,
-    columns: int = 24,
+    rows: int = 40,
+    columns: int = 20,
 ) -> Piece:
     """Long hair on one side (Left or Right) of a parting in the middle of the head (around `centre`), which falls to
     the front of the shoulder.
@@ -170,7 +170,7 @@ def front_hair(
         edge = temple + 0.035 * share
         aside = 1.7 * smoothstep(edge - x, -0.01, 0.03) * (gone < 0.25)
         ahead = 0.75 * smoothstep(gone, 0.14, 0.24) * smoothstep(gone, 0.42, 0.3) * smoothstep(p[:, 2], 0.13, 0.05)
-        inward = -0.25 * smoothstep(gone, 0.2, 0.3) * smoothstep(x, temple + 0.02, temple + 0.08)
+        inward = -0.3 * smoothstep(gone, 0.2, 0.3) * smoothstep(x - temple - 0.085 * share, 0.0, 0.05)
         return np.stack([(aside + inward) * sign, -np.ones(columns), ahead], axis=1)
 
     ragged = 1 + 0.04 * np.sin(share * 23) + 0.03 * np.sin(share * 41 + 1)

@@ -28,6 +28,7 @@ class Face:
     brow: Float[np.ndarray, "3"]
     lips: Float[np.ndarray, "3"]
     iris: Float[np.ndarray, "3"]
+    aperture: float = 1.0
     mouth: float = -0.0605
     lash: float = 0.92
     heavy: float = 1.0
@@ -49,7 +50,7 @@ def paint_skin(face: Face, p: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 
     colour = mix(colour, rosy, 0.3 * front * blob(x / 0.013, (y + 0.036) / 0.013, 0.0))
     # Lids: shadow above the eye, a dark lash line around its opening.
     colour = mix(colour, face.skin * 0.66, 0.6 * front * blob(ex / 0.019, (y - 0.007) / 0.012, 0.2))
-    lash = blob(ex / 0.0175, (y - 0.002) / 0.0095, 0.8)
+    lash = blob(ex / 0.0175, (y - 0.002) / (0.0095 * face.aperture), 0.8)
     colour = mix(colour, np.array([38.0, 24, 20]), face.lash * front * lash)
     arch = 0.0205 + 0.0045 * np.cos((ex - 0.004) / 0.02 * 1.5) - 0.0035
     thickness = (0.0036 * smoothstep(ex, 0.029, 0.0) + 0.0008) * face.heavy

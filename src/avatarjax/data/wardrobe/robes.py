@@ -61,7 +61,7 @@ def long_skirt(
 def sleeve_bell(
     rig: Rig,
     side: str,
-    body: Float[np.ndarray, "v 3"],
+    lie_on: drape.Ground,
     weights: Float[np.ndarray, "v j"],
     *,
     start: float,
@@ -73,11 +73,11 @@ def sleeve_bell(
     rows: int = 26,
     columns: int = 40,
 ) -> Piece:
-    """A wide sleeve (`side` is Left or Right) around the arm of the dressed body (v, 3), one tube sewn on at its upper
-    end.
+    """A wide sleeve (`side` is Left or Right) around the arm of a dressed body, one tube sewn on at its upper end.
 
     It begins `start` metres below the shoulder joint and ends `past_wrist` metres after the wrist, where it is `width`
-    metres wider than the arm and hangs `drop` metres below it. Its weights come from the body's (v, j).
+    metres wider than the arm and hangs `drop` metres below it. Its weights come from
+    the body's (v, j), whose points are the ground.
     """
     # The right sleeve is made as a left one on the mirrored body.
     mirror = np.array([1.0 if side == "Left" else -1.0, 1, 1])
@@ -94,7 +94,8 @@ def sleeve_bell(
     wrist = np.linalg.norm(np.diff(np.stack(joints[:3]), axis=0), axis=1).sum()
 
     arms = [rig.index(n) for n in rig.names if n.startswith(side) and ("Arm" in n or "Hand" in n)]
-    arm = (body * mirror)[weights[:, arms].sum(1) > 0.4]
+    on_arm = weights[:, arms].sum(1) > 0.4
+    arm = lie_on.points[on_arm] * mirror
     angles = np.arange(columns) * 2 * np.pi / columns
     rings = []
     for share in np.linspace(0, 1, rows):
@@ -120,14 +121,20 @@ def sleeve_bell(
     points = np.stack(rings)
     for _ in range(2):
         points[2:-1] = (points[1:-2] + 2 * points[2:-1] + points[3:]) / 4
+    points = points * mirror
+    # Its end is sewn into the cloth below, so that no edge stands off.
+    for i, sunk in ((0, -0.002), (1, 0.0015)):
+        for _ in range(4):
+            height, normal = lie_on.height(points[i])
+            points[i] -= normal * np.clip(height - sunk, -0.01, 0.01)[:, None]
+    for i in range(2, rows):
+        points[i] = lie_on.clear(points[i], 0.75 * margin * min(1.0, (i + 2) / 7))
     faces, uvs = grid_faces(rows, columns, closed=True)
-    if side == "Right":
-        points = points * mirror
-    else:
+    if side == "Left":
         faces, uvs = faces[:, ::-1].copy(), uvs[:, ::-1].copy()
     down = drape.walked(points)
     reach = 1.3 * np.clip(down - down[1], 0, None)
     vertices = points.reshape(-1, 3).astype(np.float32)
-    carried = nearest_weights(vertices, body, weights)
+    carried = nearest_weights(vertices, lie_on.points[on_arm], weights[on_arm])
     name = side.lower() + " sleeve"
     return Piece(name, vertices, faces, uvs, carried, reach.ravel().astype(np.float32), fabric=fabric, solid=False)
