@@ -8,7 +8,7 @@ from jaxtyping import Float
 from avatarjax.data.body import Rig
 from avatarjax.data.wardrobe import fabrics
 from avatarjax.data.wardrobe.garments import Piece, grid_faces, one_bone, smoothstep
-from avatarjax.data.wardrobe.tailoring import hold_clear
+from avatarjax.data.wardrobe.tailoring import Ground
 from avatarjax.physics.cloth import Fabric
 
 
@@ -81,7 +81,7 @@ def braid(
     rig: Rig,
     name: str,
     knots: Float[np.ndarray, "k 3"],
-    solids: list[Piece],
+    ground: Ground,
     *,
     root: str = "Head",
     width: float = 0.026,
@@ -91,14 +91,14 @@ def braid(
     rows: int = 44,
     columns: int = 10,
 ) -> Piece:
-    """A braid along knots (k, 3) from the scalp, held clear of solid pieces; it hangs from the bone `root`.
+    """A braid along knots (k, 3) from the scalp, held clear of the ground; it hangs from the bone `root`.
 
     `width` is its half width and `sewn` the length that does not swing, metres. Its width pulses with the plaits, and
     it ends in a tie and a tuft.
     """
     path = path_through(knots, rows)
     for _ in range(4):
-        path = hold_clear(path, solids, margin + width, rounds=2)
+        path = ground.hold_clear(path, margin + width, rounds=2)
         path[1:-1] = (path[:-2] + 2 * path[1:-1] + path[2:]) / 4
     path = path_through(path, rows)
     s = np.linspace(0, 1, rows)
@@ -134,46 +134,44 @@ def paint_braid(
 
 def full_beard(
     rig: Rig,
-    skin: Piece,
+    ground: Ground,
     chin: Float[np.ndarray, "3"],
     *,
     jaw: float,
     bottom: float,
     width: float = 0.07,
-    depth: float = 0.032,
+    depth: float = 0.03,
     margin: float = 0.012,
     rows: int = 26,
     columns: int = 24,
-    solids: list[Piece] | None = None,
 ) -> Piece:
-    """A long beard that grows from the chin (3,), a point of the `skin`, and hangs before the chest to height `bottom`.
+    """A long beard that grows from the chin (3,) and hangs before the chest to height `bottom`.
 
     It starts at height `jaw` under the lower lip, inside the face; `width` and `depth` are its half axes at the chin,
-    metres. Above the chin it is sewn to the head, below it hangs free of the skin and other solids.
+    metres. Above the chin it is sewn to the head, below it hangs clear of the ground.
     """
-    front = chin + np.array([0, 0, 0.012])
     knots = np.array(
         [
-            [0, jaw, front[2] - 0.045],
-            [0, chin[1], front[2] - 0.012],
-            [0, 0.6 * chin[1] + 0.4 * bottom, front[2] + 0.012],
-            [0, 0.3 * chin[1] + 0.7 * bottom, front[2] + 0.02],
-            [0, bottom, front[2] + 0.02],
+            [0, jaw, chin[2] - 0.03],
+            [0, chin[1], chin[2] - 0.004],
+            [0, 0.6 * chin[1] + 0.4 * bottom, chin[2] + 0.002],
+            [0, 0.3 * chin[1] + 0.7 * bottom, chin[2] + 0.006],
+            [0, bottom, chin[2] + 0.01],
         ]
     )
     path = path_through(knots, rows)
     s = np.linspace(0, 1, rows)
-    wide = width * np.interp(s, [0, 0.2, 0.45, 0.75, 0.93, 1], [0.72, 1.0, 0.98, 0.62, 0.3, 0.1])
+    wide = width * np.interp(s, [0, 0.2, 0.45, 0.75, 0.93, 1], [0.8, 1.0, 0.98, 0.66, 0.3, 0.1])
     deep = depth * np.interp(s, [0, 0.2, 0.5, 0.8, 1], [0.8, 1.0, 0.95, 0.6, 0.12])
-    below = path[:, 1] < chin[1] - 0.01
-    others = [skin, *(solids or [])]
+    # The roots are in the skin; further down the whole tube is before the chest.
+    share = smoothstep(chin[1] - path[:, 1], 0.02, 0.07)
     for _ in range(4):
-        held = hold_clear(path, others, margin + deep, rounds=1)
-        path[below] = path[below] * np.array([1, 1, 0]) + held[below] * np.array([0, 0, 1])
+        held = ground.hold_clear(path, (margin + deep) * share - (1 - share), rounds=1)
+        path[:, 2] = held[:, 2]
         path[1:-1] = (path[:-2] + 2 * path[1:-1] + path[2:]) / 4
     path[:, 0] = 0
     fall = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    start = np.interp(0.0, chin[1] - 0.015 - path[:, 1], fall)
+    start = np.interp(0.0, chin[1] - 0.045 - path[:, 1], fall)
     reach = 1.3 * np.clip(fall - start, 0, None)
     weights = one_bone(rig, "Head", rows)
     piece = tube("beard", path, np.array([1.0, 0, 0]), wide, deep, weights, reach, columns=columns)
@@ -192,5 +190,73 @@ def full_beard(
         piece.reach,
         piece.braces,
         piece.fabric,
+        solid=False,
+    )
+
+
+def locks(
+    rig: Rig,
+    roots: Float[np.ndarray, "k 3"],
+    outward: Float[np.ndarray, "k 3"],
+    ground: Ground,
+    *,
+    bottom: float,
+    radius: float = 0.021,
+    sewn: float = 0.05,
+    margin: float = 0.008,
+    rows: int = 18,
+    columns: int = 8,
+    seed: int = 80,
+) -> Piece:
+    """Thick locks of wild hair, one tube from each root (k, 3) on the scalp, where the skin faces `outward` (k, 3).
+
+    They part from the head by their thickness, `radius` metres, and hang over the ground to about height `bottom`;
+    no two are alike, but the same every time. The first `sewn` metres do not swing.
+    """
+    rng = np.random.default_rng(seed)
+    tubes = []
+    for root, out in zip(roots.astype(np.float64), outward.astype(np.float64), strict=True):
+        low = bottom + rng.uniform(-0.04, 0.04)
+        level = out * np.array([1, 0, 1]) / max(np.linalg.norm(out[[0, 2]]), 1e-6)
+        sway = 0.012 * rng.normal(size=(3, 3)) * np.array([1, 0.3, 1])
+        thick = radius * rng.uniform(0.85, 1.2)
+        start = root - 0.006 * out
+        knots = np.array(
+            [
+                start,
+                start + level * thick + np.array([0, -0.02, 0]),
+                start * [1, 0.65, 1] + level * 1.4 * thick + sway[0] + np.array([0, 0.35 * low, 0]),
+                start * [1, 0.3, 1] + level * 1.8 * thick + sway[1] + np.array([0, 0.7 * low, 0]),
+                start * [1, 0, 1] + level * 2.2 * thick + sway[2] + np.array([0, low, 0]),
+            ]
+        )
+        path = path_through(knots, rows)
+        s = np.linspace(0, 1, rows)
+        girth = thick * np.interp(s, [0, 0.15, 0.5, 0.85, 1], [0.75, 1.0, 1.05, 0.6, 0.16])
+        hangs = smoothstep(s, 0.08, 0.25)
+        for _ in range(4):
+            path = ground.hold_clear(path, (margin + girth) * hangs - (1 - hangs), rounds=1)
+            path[1:-1] = (path[:-2] + 2 * path[1:-1] + path[2:]) / 4
+        path = path_through(path, rows)
+        length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+        reach = 1.3 * np.clip(s * length - sewn, 0, None)
+        aside = np.array([level[2], 0, -level[0]])
+        weights = one_bone(rig, "Head", rows)
+        tubes.append(tube("hair", path, aside, girth, 0.8 * girth, weights, reach, columns=columns))
+    starts = np.arange(len(tubes)) * rows * columns
+    braces = [t.braces + start for t, start in zip(tubes, starts, strict=True) if t.braces is not None]
+    uvs = []
+    for k, t in enumerate(tubes):
+        # Each lock has a strip of the uv square of its own.
+        uvs.append(t.uvs * np.array([0.96 / len(tubes), 1], np.float32) + np.array([k / len(tubes), 0], np.float32))
+    return Piece(
+        "hair",
+        np.concatenate([t.vertices for t in tubes]),
+        np.concatenate([t.faces + start for t, start in zip(tubes, starts, strict=True)]).astype(np.int32),
+        np.concatenate(uvs),
+        np.concatenate([t.weights for t in tubes]),
+        np.repeat(np.concatenate([t.reach[::columns] for t in tubes if t.reach is not None]), columns),
+        np.concatenate(braces).astype(np.int32),
+        fabrics.HAIR,
         solid=False,
     )

@@ -135,7 +135,7 @@ def shoulder_strap(
     smooth = path.copy()
     for _ in range(3):
         smooth[1:-1] = (smooth[:-2] + 2 * smooth[1:-1] + smooth[2:]) / 4
-    depth, normal = tailoring.clearance(smooth, under.vertices, under.faces)
+    depth, normal = tailoring.Ground.of([under]).clearance(smooth)
     smooth += normal * np.clip(lift - depth, 0, 0.03)[:, None]
     return strap("strap", smooth, normal, under)
 

@@ -4,9 +4,10 @@ it."""
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from avatarjax.data.body import Rig
@@ -92,43 +93,47 @@ def let_out(piece: Piece, thickness: np.ndarray | float, smooth: float = 0.6, ro
     return dataclasses.replace(piece, vertices=out.astype(np.float32))
 
 
-def clearance(
-    points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Metres (n,) of points outside the nearest place of a surface, along its normals (n, 3) there; negative inside."""
-    corners = vertices[faces].astype(np.float64)
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    smooth = assembly.vertex_normals(vertices, faces).astype(np.float64)
-    # Samples on the surface: the corners, the middles of the edges, and the centres.
-    mixes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1], [1, 1, 1]], float)
-    mixes /= mixes.sum(1, keepdims=True)
-    kept = np.linalg.norm(flat, axis=1) > 1e-9
-    places = np.einsum("mk,fkd->fmd", mixes, corners[kept]).reshape(-1, 3)
-    normals = np.einsum("mk,fkd->fmd", mixes, smooth[faces[kept]]).reshape(-1, 3)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    _, nearest = cKDTree(places).query(points, k=3)
-    normal = normals[nearest].mean(1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    depth = ((points[:, None] - places[nearest]) * normal[:, None]).sum(-1).min(1)
-    return depth, normal
+@dataclasses.dataclass(frozen=True, eq=False)
+class Ground:
+    """Solid pieces that cloth stays clear of: places (n, 3) all over their surfaces, and the normals (n, 3) there."""
 
+    places: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    tree: cKDTree
 
-def hold_clear(
-    points: Float[np.ndarray, "n 3"],
-    solids: list[Piece],
-    margin: np.ndarray | float,
-    rounds: int = 3,
-    deepest: float = 0.06,
-) -> Float[np.ndarray, "n 3"]:
-    """Points (n, 3) pushed out of solid pieces until they are `margin` metres, () or (n,), away; what lies deeper than
-    `deepest` metres is taken to be beyond the far side, and left."""
-    moved = points.astype(np.float64)
-    for _ in range(rounds):
-        for solid in solids:
-            depth, normal = clearance(moved, solid.vertices, solid.faces)
+    @classmethod
+    def of(cls, pieces: Sequence[Piece]) -> Ground:
+        """The ground that some pieces make together."""
+        # The corners, the middles of the edges, and the centre of each triangle.
+        mixes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1], [1, 1, 1]], float)
+        mixes /= mixes.sum(1, keepdims=True)
+        places, normals = [], []
+        for piece in pieces:
+            smooth = assembly.vertex_normals(piece.vertices, piece.faces).astype(np.float64)
+            places.append(np.einsum("mk,fkd->fmd", mixes, piece.vertices[piece.faces]).reshape(-1, 3))
+            normals.append(np.einsum("mk,fkd->fmd", mixes, smooth[piece.faces]).reshape(-1, 3))
+        place, normal = np.concatenate(places), np.concatenate(normals)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        return cls(place, normal, cKDTree(place))
+
+    def clearance(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """Metres (n,) of points outside the nearest places, along their normals (n, 3); negative inside."""
+        _, nearest = self.tree.query(points, k=3)
+        normal = self.normals[nearest].mean(1)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        return ((points[:, None] - self.places[nearest]) * normal[:, None]).sum(-1).min(1), normal
+
+    def hold_clear(
+        self, points: Float[np.ndarray, "n 3"], margin: np.ndarray | float, rounds: int = 3, deepest: float = 0.06
+    ) -> Float[np.ndarray, "n 3"]:
+        """Points (n, 3) pushed out until they are `margin` metres, () or (n,), away; what lies deeper than `deepest`
+        metres is taken to be beyond the far side, and left."""
+        moved = points.astype(np.float64)
+        for _ in range(rounds):
+            depth, normal = self.clearance(moved)
             push = np.where(depth > -deepest, np.clip(margin - depth, 0, deepest), 0)
             moved = moved + normal * push[:, None]
-    return moved
+        return moved
 
 
 def bones(rig: Rig, *words: str) -> list[int]:
