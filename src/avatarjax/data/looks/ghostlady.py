@@ -29,11 +29,10 @@ class _Cut:
     bodice: bodice.Bodice
 
     def scalp(self, p: np.ndarray) -> np.ndarray:
-        """1 under the hair: behind a line from the forehead past the temples and ears to the nape."""
+        """1 under the hair: behind a line from the forehead past the temples to the nape."""
         y, back = p[:, 1] - self.face.eye[1], self.face.eye[2] - p[:, 2]
-        line = np.maximum(0.076 - 10 * p[:, 0] ** 2 - 1.1 * np.clip(back - 0.022, 0, None), -0.06)
-        ear = makeup.blob((back - 0.088) / 0.03, (y + 0.02) / 0.035, 0.9) * (np.abs(p[:, 0]) > 0.06)
-        return smoothstep(y - line, -0.006, 0.006) * (1 - ear) * (y > -0.09)
+        line = np.maximum(0.072 - 10 * p[:, 0] ** 2 - 1.1 * np.clip(back - 0.022, 0, None), -0.06)
+        return smoothstep(y - line, -0.006, 0.006) * (y > -0.09)
 
 
 def look() -> assembly.AvatarMesh:
@@ -57,6 +56,9 @@ def look() -> assembly.AvatarMesh:
     skin = bodice.visible_skin(body, bare)
     p = skin.vertices.astype(np.float64)
     dressed, scalp = cut.bodice.covered(p), cut.scalp(p)
+    # Her ears are flat under the hair.
+    away = p - eye.mean(0) - np.array([0, -0.012, -0.095])
+    skin = bodice.span(skin, (np.hypot(away[:, 1] / 0.045, away[:, 2] / 0.04) < 1) & (np.abs(p[:, 0]) > 0.05))
     thick = (0.001 + 0.006 * cut.bodice.taper(p)) * dressed + 0.009 * scalp
     skin, normals = bodice.put_on(skin, 0.8 * dressed + 0.3 * scalp, thick, rounds=30)
     arms = skin.weights[:, [rig.index(n) for n in rig.names if "Arm" in n or "Hand" in n]].sum(1)
@@ -76,7 +78,7 @@ def look() -> assembly.AvatarMesh:
         for s in ("Left", "Right")
     ]
     hair = [
-        hoods.front_hair(rig, s, torso, middle, length=0.64, hairline=0.62, crown=2.0, temple=0.036)
+        hoods.front_hair(rig, s, torso, middle, length=0.64, hairline=0.62, crown=1.85, temple=0.031)
         for s in ("Left", "Right")
     ]
     strands = [(h.vertices, assembly.vertex_normals(h.vertices, h.faces)) for h in hair]

@@ -85,9 +85,11 @@ def look() -> assembly.AvatarMesh:
     # The habit is wide: it is bloused over the belt.
     blouse = 0.02 * np.exp(-(((p[:, 1] - waist - 0.07) / 0.06) ** 2))
     thick = (0.002 + 0.011 * cut.bodice.taper(p) + blouse) * dressed + 0.006 * cut.cape(p) + 0.007 * beard
-    chin = (
-        beard * smoothstep(p[:, 1], face.eye[1] - 0.085, face.eye[1] - 0.115) * smoothstep(np.abs(p[:, 0]), 0.06, 0.0)
-    )
+    low = smoothstep(p[:, 1], face.eye[1] - 0.08, face.eye[1] - 0.11)
+    chin = beard * low * smoothstep(np.abs(p[:, 0]), 0.06, 0.0)
+    # Coarse cloth spans the hollows of an old chest.
+    chest = np.hypot((np.abs(p[:, 0]) - 0.075) / 0.075, (p[:, 1] - 1.225) / 0.1) < 1
+    skin = bodice.span(skin, chest & (p[:, 2] > 0.03))
     skin, normals = bodice.put_on(skin, 0.9 * dressed, thick + 0.016 * chin, rounds=60)
     arms = [rig.index(n) for n in rig.names if "Arm" in n or "Hand" in n]
     trunk = skin.vertices[skin.weights[:, arms].sum(1) < 0.5]

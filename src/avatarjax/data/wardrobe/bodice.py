@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy import sparse
+from scipy.sparse import linalg
 
 from avatarjax.data.body import Body, Rig
 from avatarjax.data.wardrobe import assembly, visibility
@@ -70,6 +72,20 @@ def visible_skin(body: Body, bare: Float[np.ndarray, "v 3"]) -> Piece:
     used = np.unique(body.faces[np.isin(body.parts, [body.groups.index(g) for g in _SKIN])])
     keep[used] = near
     return assembly.body_piece(body, bare, ("body",), "body", keep=keep)
+
+
+def span(skin: Piece, over: Bool[np.ndarray, " v"]) -> Piece:
+    """The skin with some of its vertices, `over` (v,), drawn tight as a membrane between the others: what cloth or hair
+    does over a hollow, a nipple or an ear."""
+    count, faces = len(skin.vertices), skin.faces
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    graph = sparse.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count)).tocsr()
+    graph = ((graph + graph.T) > 0).astype(np.float64)
+    laplacian = (sparse.diags(np.asarray(graph.sum(1)).ravel()) - graph).tocsr()[over]
+    fixed = skin.vertices[~over].astype(np.float64)
+    vertices = skin.vertices.copy()
+    vertices[over] = linalg.spsolve(laplacian[:, over].tocsc(), -(laplacian[:, ~over] @ fixed))
+    return dataclasses.replace(skin, vertices=vertices)
 
 
 def put_on(

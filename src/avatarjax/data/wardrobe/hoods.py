@@ -92,7 +92,7 @@ def veil(
     *,
     length: float,
     tilt: float = 0.2,
-    spread: float = 1.75,
+    spread: float = 1.45,
     gap: float = 0.014,
     tatter: float = 0.1,
     fabric: Fabric = fabrics.SILK,
@@ -159,7 +159,7 @@ def front_hair(
     sign = 1.0 if side == "Left" else -1.0
     share = np.linspace(0, 1, columns)
     turn = hairline + (crown - hairline) * share
-    up = np.stack([np.full(columns, 0.03 * sign), np.sin(turn), np.cos(turn)], axis=1)
+    up = np.stack([np.full(columns, 0.012 * sign), np.sin(turn), np.cos(turn)], axis=1)
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     head = lie_on.points[lie_on.points[:, 1] > centre[1] - 0.1]
     roots = lie_on.clear(drape.even(drape.outward(head, centre, up), columns), 0.006)

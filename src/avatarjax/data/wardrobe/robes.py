@@ -94,8 +94,12 @@ def sleeve_bell(
     wrist = np.linalg.norm(np.diff(np.stack(joints[:3]), axis=0), axis=1).sum()
 
     arms = [rig.index(n) for n in rig.names if n.startswith(side) and ("Arm" in n or "Hand" in n)]
-    on_arm = weights[:, arms].sum(1) > 0.4
+    on_arm = weights[:, arms].sum(1) > 0.6
     arm = lie_on.points[on_arm] * mirror
+    # Fingers look every way, and the sleeve ends before them.
+    fingers = [rig.index(n) for n in rig.names if n.startswith(side + "Hand") and n != side + "Hand"]
+    palm = weights[:, fingers].sum(1) < 0.3
+    clear_of = drape.ground((lie_on.points[palm], lie_on.normals[palm]))
     angles = np.arange(columns) * 2 * np.pi / columns
     rings = []
     for share in np.linspace(0, 1, rows):
@@ -128,7 +132,11 @@ def sleeve_bell(
             height, normal = lie_on.height(points[i])
             points[i] -= normal * np.clip(height - sunk, -0.01, 0.01)[:, None]
     for i in range(2, rows):
-        points[i] = lie_on.clear(points[i], 0.75 * margin * min(1.0, (i + 2) / 7))
+        if i < 8:
+            # From there it rises from the arm little by little.
+            height, normal = clear_of.height(points[i])
+            points[i] -= normal * np.clip(height - 0.004 * i, 0, 0.03)[:, None]
+        points[i] = clear_of.clear(points[i], 0.75 * margin * min(1.0, (i + 2) / 7))
     faces, uvs = grid_faces(rows, columns, closed=True)
     if side == "Left":
         faces, uvs = faces[:, ::-1].copy(), uvs[:, ::-1].copy()
