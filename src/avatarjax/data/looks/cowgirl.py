@@ -1,5 +1,5 @@
-"""The cowgirl: a young woman in a shirt, a leather vest and a knee-length denim skirt, with long hair, boots and a
-hat."""
+"""The cowgirl: a young woman in a shirt, a leather vest and a knee-length denim skirt, with two braids, boots, a hat
+and a belt of cartridges."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 
 from avatarjax.data.body import load_body, shape
-from avatarjax.data.wardrobe import accessories, assembly, garments, makeup
+from avatarjax.data.wardrobe import accessories, assembly, beards, garments, makeup, patterns, props, tailoring
 from avatarjax.data.wardrobe.garments import smoothstep
 from avatarjax.data.wardrobe.textures import mix, noise
 
@@ -76,9 +76,9 @@ class _Cut:
         """1 under the hair: behind a line from the forehead past the temples and ears to the nape."""
         y, back = p[:, 1] - self.face.eye[1], self.face.eye[2] - p[:, 2]
         line = 0.062 - 1.1 * np.clip(back - 0.022, 0, None)
-        line = np.maximum(line, -0.055)
+        line = np.maximum(line, -0.085)
         ear = makeup.blob((back - 0.088) / 0.03, (y + 0.02) / 0.035, 0.9) * (np.abs(p[:, 0]) > 0.06)
-        return smoothstep(y - line, -0.006, 0.006) * (1 - ear) * (y > -0.08)
+        return smoothstep(y - line, -0.006, 0.006) * (1 - ear) * (y > -0.11)
 
 
 def look() -> assembly.AvatarMesh:
@@ -110,29 +110,27 @@ def look() -> assembly.AvatarMesh:
     whole = assembly.body_piece(body, bare, ("body",), "body")
     skin = assembly.body_piece(body, bare, ("body",), "body", keep=bare[:, 1] > boot_top - 0.03)
     skin = _thicken(skin, cut)
-    normals = assembly.vertex_normals(skin.vertices, skin.faces)
     eyes = assembly.body_piece(body, bare, ("helper-l-eye", "helper-r-eye"), "eyes")
     head = skin.vertices[skin.weights[:, rig.index("Head")] > 0.6]
     boots = [accessories.boot(rig, s, whole.vertices, whole.weights, top=boot_top) for s in ("Left", "Right")]
     hat = accessories.hat(rig, head, base=float(face.eye[1]) + 0.058)
-    no_arm = skin.weights[:, [rig.index(n) for n in rig.names if "Arm" in n or "Hand" in n]].sum(1) < 0.5
-    hair = accessories.long_hair(
-        rig,
-        skin.vertices[no_arm],
-        normals[no_arm],
-        head,
-        top=float(face.eye[1]) + 0.04,
-        ear=float(face.eye[1]) - 0.05,
-        bottom=float(joint["Spine1"][1]) + 0.02,
-    )
+    braids = _braids(rig, skin, face, bottom=float(joint["Spine2"][1]) - 0.1)
     arms = [rig.index(n) for n in rig.names if "Arm" in n or "Hand" in n or "Shoulder" in n]
     trunk = skin.vertices[skin.weights[:, arms].sum(1) < 0.3]
     skirt = garments.skirt(rig, trunk, top=cut.waist, bottom=knee + 0.02, flare=0.3)
+    belt = props.bullet_belt(rig, skirt.vertices, left=cut.waist - 0.045, right=cut.waist - 0.1)
+    # Where the belt lies on the skirt, it holds it.
+    loose = 1.5 * np.clip(belt.vertices[:, 1].min() - 0.012 - skirt.vertices[:, 1], 0, None)
+    skirt = dataclasses.replace(skirt, reach=loose.astype(np.float32))
 
     layers = [
         assembly.Layer(skin, (0.0, 0.0, 0.74, 0.74), lambda p, n, uv: _paint_body(cut, p)),
-        assembly.Layer(hair, (0.74, 0.0, 1.0, 0.36), _paint_hair),
-        assembly.Layer(_spread_eyes(eyes), (0.88, 0.74, 1.0, 0.86), lambda p, n, uv: makeup.paint_eyes(face, p)),
+        assembly.Layer(braids[0], (0.74, 0.0, 0.82, 0.36), _paint_braid),
+        assembly.Layer(braids[1], (0.82, 0.0, 0.9, 0.36), _paint_braid),
+        assembly.Layer(belt, (0.88, 0.86, 1.0, 1.0), _paint_bullet_belt),
+        assembly.Layer(
+            tailoring.spread_uvs(eyes), (0.88, 0.74, 1.0, 0.86), lambda p, n, uv: makeup.paint_eyes(face, p)
+        ),
         assembly.Layer(hat, (0.74, 0.36, 1.0, 0.74), _paint_hat),
         assembly.Layer(boots[0], (0.6, 0.74, 0.74, 1.0), _paint_boot),
         assembly.Layer(boots[1], (0.74, 0.74, 0.88, 1.0), _paint_boot),
@@ -149,14 +147,29 @@ def _thicken(skin: garments.Piece, cut: _Cut) -> garments.Piece:
     dressed, scalp = cut.torso(p), cut.scalp(p)
     smooth = assembly.relax(skin.vertices, skin.faces, (0.6 * dressed + 0.3 * scalp).astype(np.float32), 12)
     normals = assembly.vertex_normals(smooth, skin.faces)
-    thick = 0.006 * dressed + 0.005 * cut.vest(p) + 0.008 * cut.bandana(p) + 0.011 * scalp
+    thick = 0.006 * dressed + 0.005 * cut.vest(p) + 0.008 * cut.bandana(p) + 0.014 * scalp
     return dataclasses.replace(skin, vertices=(smooth + normals * thick[:, None]).astype(np.float32))
 
 
-def _spread_eyes(eyes: garments.Piece) -> garments.Piece:
-    """The eyeballs' corner of the body's uv square, spread over a square of their own."""
-    low, high = eyes.uvs.min(axis=(0, 1)), eyes.uvs.max(axis=(0, 1))
-    return dataclasses.replace(eyes, uvs=((eyes.uvs - low) / (high - low)).astype(np.float32))
+def _braids(rig: garments.Rig, skin: garments.Piece, face: makeup.Face, bottom: float) -> list[garments.Piece]:
+    """Two braids from behind the ears over the front of the shoulders down to about height `bottom`."""
+    ground = tailoring.Ground.of([skin])
+    eye = face.eye
+    neck = rig.heads[rig.index("Neck")]
+    braids = []
+    for name, side in (("left braid", 1.0), ("right braid", -1.0)):
+        knots = np.array(
+            [
+                [0.05, eye[1] - 0.045, eye[2] - 0.13],
+                [0.07, eye[1] - 0.085, eye[2] - 0.115],
+                [0.088, neck[1] + 0.0, neck[2] + 0.045],
+                [0.092, neck[1] - 0.09, neck[2] + 0.115],
+                [0.086, 0.5 * (neck[1] - 0.09 + bottom), neck[2] + 0.15],
+                [0.08, bottom, neck[2] + 0.15],
+            ]
+        )
+        braids.append(beards.braid(rig, name, knots * np.array([side, 1, 1]), ground, width=0.023))
+    return braids
 
 
 def _paint_body(cut: _Cut, p: np.ndarray) -> np.ndarray:
@@ -206,13 +219,22 @@ def _paint_skirt(p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return mix(colour, _BRASS * 0.6, ahead * smoothstep(np.abs(buckle - 0.6), 0.12, 0.06))
 
 
-def _paint_hair(p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    # Streaks run down the strands and wander a little.
-    across = uv[:, 0] + 0.004 * np.sin(uv[:, 1] * 14 + uv[:, 0] * 40)
-    line = np.stack([across * 1.0, uv[:, 1] * 0.02, np.zeros(len(uv))], axis=1)
-    streak = 0.13 * noise(line, 0.006, 9) + 0.16 * noise(line, 0.02, 10)
-    ends = 0.16 * (1 - uv[:, 1])
-    return _HAIR * (0.92 + streak + ends)[:, None]
+def _paint_braid(p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    return beards.paint_braid(uv, _HAIR, _BANDANA)
+
+
+def _paint_bullet_belt(p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    u, v = uv[:, 0], uv[:, 1]
+    band = patterns.leather(p, _BELT * 1.25, 15)
+    buckle = np.minimum(u, 1 - u)
+    band = mix(band, _BRASS, smoothstep(buckle, 0.026, 0.023))
+    band = mix(band, _BRASS * 0.6, smoothstep(np.abs(buckle - 0.014), 0.004, 0.002))
+    # Along a cartridge: the rim of its case, the brass, and the lead of the bullet.
+    height = v / 0.48
+    brass = _BRASS * np.array([1.08, 1.04, 0.92]) * (1 + 0.12 * np.cos(2 * np.pi * 34 * u))[:, None]
+    case = mix(brass, _BRASS * 0.55, smoothstep(np.abs(height - 0.22), 0.06, 0.02))
+    case = mix(case, np.array([186.0, 120.0, 84.0]), smoothstep(height, 0.58, 0.62))
+    return mix(case, band, smoothstep(v, 0.49, 0.495))
 
 
 def _paint_hat(p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:

@@ -97,8 +97,9 @@ def braid(
     it ends in a tie and a tuft.
     """
     path = path_through(knots, rows)
+    hangs = smoothstep(np.linspace(0, 1, rows), 0.03, 0.16)
     for _ in range(4):
-        path = ground.hold_clear(path, margin + width, rounds=2)
+        path = ground.hold_clear(path, (margin + width) * hangs - (1 - hangs), rounds=2)
         path[1:-1] = (path[:-2] + 2 * path[1:-1] + path[2:]) / 4
     path = path_through(path, rows)
     s = np.linspace(0, 1, rows)
@@ -124,7 +125,7 @@ def paint_braid(
     slant = np.abs(np.sin(turn))
     phase = s / 0.86 * plaits - 0.45 * slant + 0.5 * (np.sin(turn) > 0)
     place = np.abs(phase % 1 - 0.5) * 2
-    fine = np.sin(40 * phase + 9 * slant) * 0.05 + np.sin(17 * turn + 60 * s) * 0.04
+    fine = np.sin(15 * phase) * 0.05
     colour = hair * (1.06 - 0.34 * smoothstep(place, 0.55, 1.0) + fine)[:, None]
     colour = mix(colour, hair * 0.5, 0.7 * smoothstep(slant, 0.16, 0.05) * (s < 0.86))
     tuft = hair * (1.05 + 0.12 * np.sin(23 * turn))[:, None]
@@ -249,13 +250,18 @@ def locks(
     for k, t in enumerate(tubes):
         # Each lock has a strip of the uv square of its own.
         uvs.append(t.uvs * np.array([0.96 / len(tubes), 1], np.float32) + np.array([k / len(tubes), 0], np.float32))
+    vertices = np.concatenate([t.vertices for t in tubes])
+    reach = np.concatenate([t.reach for t in tubes if t.reach is not None])
+    # Where a tube as a whole went astray between two surfaces, its own vertices give way.
+    free = reach > 0
+    vertices[free] = ground.hold_clear(vertices[free], 0.0065, rounds=5)
     return Piece(
         "hair",
-        np.concatenate([t.vertices for t in tubes]),
+        vertices,
         np.concatenate([t.faces + start for t, start in zip(tubes, starts, strict=True)]).astype(np.int32),
         np.concatenate(uvs),
         np.concatenate([t.weights for t in tubes]),
-        np.repeat(np.concatenate([t.reach[::columns] for t in tubes if t.reach is not None]), columns),
+        reach,
         np.concatenate(braces).astype(np.int32),
         fabrics.HAIR,
         solid=False,

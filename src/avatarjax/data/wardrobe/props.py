@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Float
 
@@ -233,4 +235,6 @@ def bullet_belt(
             faces, uvs = faces[:, [0, 2, 1]], uvs[:, [0, 2, 1]]
         parts.append(Piece("cartridge", points, faces, uvs, one_bone(rig, "Hips", len(points))))
     whole = (0.0, 0.0, 1.0, 1.0)
-    return tailoring.join("bullet belt", [(part, whole) for part in parts])
+    belt = tailoring.join("bullet belt", [(part, whole) for part in parts])
+    # It lies on cloth, which would find itself inside it if it were solid.
+    return dataclasses.replace(belt, solid=False)
