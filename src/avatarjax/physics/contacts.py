@@ -84,49 +84,58 @@ def find_planes(positions: Float[Array, "n 3"], surface: Surface) -> Int[Array, 
 
 
 def take_planes(surface: Surface, planes: Int[Array, "g n"]) -> Surface:
-    """The points and normals (g, n, 3) that `find_planes` found."""
+    """The points and normals that `find_planes` found, as columns (g, 3, n)."""
     group = jnp.arange(planes.shape[0])[:, None]
-    return Surface(surface.points[group, planes], surface.normals[group, planes])
+    return jax.tree.map(lambda x: jnp.moveaxis(x[group, planes], 2, 1), surface)
 
 
 def push_out(
-    positions: Float[Array, "n 3"],
-    previous: Float[Array, "n 3"],
+    positions: Float[Array, "3 n"],
+    previous: Float[Array, "3 n"],
     planes: Surface,
-    moved: Float[Array, "g n 3"],
+    moved: Float[Array, "g 3 n"],
     clearance: Float[Array, " n"],
     friction: Float[Array, " n"],
-) -> Float[Array, "n 3"]:
-    """Positions (n, 3) moved out of the half-spaces behind the planes of each group, one group after the other.
+) -> Float[Array, "3 n"]:
+    """Positions (3, n) moved out of the half-spaces behind planes (g, 3, n) with unit normals, one group after the
+    other.
 
-    `previous` (n, 3) are the positions before the step and `moved` (g, n, 3) how far the surface went in it: friction
-    takes away up to the vertex's share of the slip between them (Coulomb, at the level of positions).
+    `previous` (3, n) are the positions before the step and `moved` (g, 3, n) how far the surface went in it: friction
+    takes away up to the vertex's share of the slip between them (Coulomb, at the level of positions). Coordinates are
+    columns, because XLA's CPU backend does not vectorise over a last axis of three.
     """
-    slip_from = previous
-    for point, normal, carried in zip(planes.points, planes.normals, moved, strict=True):
-        offset = positions - point
-        height = jnp.sum(offset * normal, axis=1)
-        aside = jnp.sum(offset * offset, axis=1) - height * height
+
+    def group(x: Array, inputs: tuple[Array, Array, Array]) -> tuple[Array, None]:
+        point, normal, carried = inputs
+        offset = x - point
+        height = _dot(offset, normal)
+        aside = _dot(offset, offset) - height * height
         held = (aside < _PLANE_RADIUS**2) & (height > -_DEEPEST)
         depth = jnp.where(held, jnp.maximum(clearance - height, 0), 0.0)
-        slip = positions - slip_from - carried
-        slip = slip - jnp.sum(slip * normal, axis=1, keepdims=True) * normal
-        length = jnp.sqrt(jnp.sum(slip * slip, axis=1) + 1e-18)
-        kept = jnp.minimum(friction * depth / length, 1.0)
-        positions = positions + depth[:, None] * normal - kept[:, None] * slip
-    return positions
+        slip = x - previous - carried
+        slip = slip - _dot(slip, normal)[None] * normal
+        kept = jnp.minimum(friction * depth * jax.lax.rsqrt(_dot(slip, slip) + 1e-18), 1.0)
+        return x + depth[None] * normal - kept[None] * slip, None
+
+    return jax.lax.scan(group, positions, (planes.points, planes.normals, moved))[0]
 
 
-def push_out_of_capsules(positions: Float[Array, "n 3"], capsules: Capsules) -> Float[Array, "n 3"]:
-    """Positions (n, 3) moved out of capsules, one after the other."""
-    for begin, end, radius in zip(capsules.begin, capsules.end, capsules.radii, strict=True):
-        axis = end - begin
-        offset = positions - begin[None]
-        share = jnp.clip((offset @ axis) / (axis @ axis + 1e-12), 0, 1)
-        away = offset - share[:, None] * axis[None]
-        length = jnp.sqrt(jnp.sum(away * away, axis=1) + 1e-18)
-        positions = positions + (jnp.maximum(radius - length, 0) / length)[:, None] * away
-    return positions
+def push_out_of_capsules(positions: Float[Array, "3 n"], capsules: Capsules) -> Float[Array, "3 n"]:
+    """Positions (3, n) moved out of capsules, one after the other."""
+
+    def capsule(x: Array, inputs: Capsules) -> tuple[Array, None]:
+        axis = (inputs.end - inputs.begin)[:, None]
+        offset = x - inputs.begin[:, None]
+        share = jnp.clip(_dot(offset, axis) / (_dot(axis, axis) + 1e-12), 0, 1)
+        away = offset - share[None] * axis
+        inverse = jax.lax.rsqrt(_dot(away, away) + 1e-18)
+        return x + jnp.maximum(inputs.radii * inverse - 1, 0)[None] * away, None
+
+    return jax.lax.scan(capsule, positions, capsules)[0]
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def find_neighbours(

@@ -22,7 +22,8 @@ from avatarjax.physics.contacts import Capsules, Surface
 
 @dataclasses.dataclass(frozen=True)
 class XPBDConfig:
-    """How a frame is simulated: `substeps` steps, contacts found anew `refreshes` times (a divisor of substeps).
+    """How a frame is simulated: `substeps` steps; solid surfaces are found anew `refreshes` times (a divisor of
+    substeps), the cloth's own neighbours once.
 
     gravity, wind in metres a second (squared); damping: share of the speed lost a second; distance: metres that parts
     of the cloth keep from each other, 0 for no self-collision, with `neighbours` candidates a vertex; top_speed: metres
@@ -67,11 +68,14 @@ class Drive:
 def step(cloth: Cloth, state: ClothState, start: Drive, end: Drive, config: XPBDConfig = XPBDConfig()) -> ClothState:
     """The cloth one frame later, while what it hangs on goes from `start` to `end`."""
     part = config.substeps // config.refreshes
+    neighbours = None
+    if config.distance > 0:
+        neighbours = contacts.find_neighbours(state.positions, cloth.rest, config.distance, config.neighbours)
 
     def refresh(state: ClothState, k: Array) -> tuple[ClothState, None]:
         low = jax.tree.map(lambda a, b: a + (b - a) * (k / config.refreshes), start, end)
         high = jax.tree.map(lambda a, b: a + (b - a) * ((k + 1) / config.refreshes), start, end)
-        return _part(cloth, state, low, high, config, part), None
+        return _part(cloth, state, low, high, neighbours, config, part), None
 
     return jax.lax.scan(refresh, state, jnp.arange(config.refreshes, dtype=jnp.float32))[0]
 
@@ -102,7 +106,15 @@ def vertex_normals(positions: Float[Array, "n 3"], faces: Array) -> Float[Array,
     return total / jnp.sqrt(jnp.sum(total * total, axis=1, keepdims=True) + 1e-18)
 
 
-def _part(cloth: Cloth, state: ClothState, start: Drive, end: Drive, config: XPBDConfig, steps: int) -> ClothState:
+def _part(
+    cloth: Cloth,
+    state: ClothState,
+    start: Drive,
+    end: Drive,
+    neighbours: Array | None,
+    config: XPBDConfig,
+    steps: int,
+) -> ClothState:
     """`steps` steps with the contacts that are near at their beginning."""
     dt = 1 / (config.fps * config.substeps)
     planes = contacts.find_planes(state.positions, start.surface)
@@ -113,9 +125,6 @@ def _part(cloth: Cloth, state: ClothState, start: Drive, end: Drive, config: XPB
     loose = free[:, None] > 0
     carried = (end.targets - start.targets) / (steps * dt)
     slower = (1 - config.damping) ** dt
-    neighbours = None
-    if config.distance > 0:
-        neighbours = contacts.find_neighbours(state.positions, cloth.rest, config.distance, config.neighbours)
 
     def one(state: ClothState, k: Array) -> tuple[ClothState, None]:
         share = (k + 1) / steps
@@ -134,11 +143,11 @@ def _part(cloth: Cloth, state: ClothState, start: Drive, end: Drive, config: XPB
         if neighbours is not None:
             x = contacts.separate(x, neighbours, cloth.rest, free, config.distance)
         x = _tie(x, target, cloth.reach)
+        columns = contacts.push_out_of_capsules(x.T, jax.tree.map(between, start.capsules, end.capsules))
         points, lean = between(low.points, high.points), between(low.normals, high.normals)
-        lean = lean * jax.lax.rsqrt(jnp.sum(lean * lean, axis=-1, keepdims=True) + 1e-12)
-        x = contacts.push_out_of_capsules(x, jax.tree.map(between, start.capsules, end.capsules))
-        x = contacts.push_out(x, before, Surface(points, lean), moved, cloth.clearance, cloth.friction)
-        x = x.at[:, 1].max(cloth.clearance)
+        lean = lean * jax.lax.rsqrt(jnp.sum(lean * lean, axis=1, keepdims=True) + 1e-12)
+        columns = contacts.push_out(columns, before.T, Surface(points, lean), moved, cloth.clearance, cloth.friction)
+        x = columns.T.at[:, 1].max(cloth.clearance)
         x = jnp.where(loose, x, target)
         velocity = (x - before) / dt
         against = velocity - carried

@@ -48,8 +48,6 @@ class LocomotionConfig:
     lean_frequency: float = 14.0
     look_per_turn: float = 0.05
     look_limit: float = 0.5
-    lag_frequency: float = 17.0
-    lag_damping: float = 0.35
 
 
 @typing.no_type_check
@@ -57,16 +55,14 @@ class LocomotionConfig:
 class Motion:
     """f frames of a moving skeleton with j bones, in the world, metres.
 
-    local_quats (f, j, 4); hips (f, 3) the hips joint; transforms (f, j, 3, 4) from the rest pose to the world; lagged
-    (f, j, 3, 4) the same, followed by an under-damped spring, for what swings behind the body; roots (f, 3) the point
-    of the ground under the figure; headings (f,) yaw, radians, not wrapped; speeds (f,) metres a second along the
-    heading.
+    local_quats (f, j, 4); hips (f, 3) the hips joint; transforms (f, j, 3, 4) from the rest pose to the world; roots
+    (f, 3) the point of the ground under the figure; headings (f,) yaw, radians, not wrapped; speeds (f,) metres a
+    second along the heading.
     """
 
     local_quats: Float[Array, "f j 4"]
     hips: Float[Array, "f 3"]
     transforms: Float[Array, "f j 3 4"]
-    lagged: Float[Array, "f j 3 4"]
     roots: Float[Array, "f 3"]
     headings: Float[Array, " f"]
     speeds: Float[Array, " f"]
@@ -230,11 +226,7 @@ def simulate(
     transforms = transforms.at[..., 1, 3].add(lift[:, None])
     hips = hips.at[:, 1].add(lift)
     roots = jnp.stack([positions[:, 0], jnp.zeros(len(actions)), positions[:, 1]], axis=1)
-    # Followed relative to the root: otherwise everything loose trails behind a steady run.
-    shift = jnp.zeros((len(actions), 1, 3, 4)).at[:, 0, :, 3].set(roots)
-    relative = transforms - shift
-    lagged = springs.follow(relative, frequency=config.lag_frequency, damping=config.lag_damping, dt=1 / config.fps)
-    return Motion(quats, hips, transforms, lagged + shift, roots, headings, speeds)
+    return Motion(quats, hips, transforms, roots, headings, speeds)
 
 
 def _ground(rig: Rig, transforms: Array, effort: Array) -> Array:
