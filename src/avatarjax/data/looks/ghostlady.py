@@ -69,11 +69,11 @@ def look() -> assembly.AvatarMesh:
 
     cotton = fabrics.COTTON
     skirt = robes.long_skirt(
-        rig, trunk, top=waist, bottom=0.035, flare=0.19, depth=0.055, folds=17, rows=40, columns=80, fabric=cotton
+        rig, trunk, top=waist, bottom=0.035, flare=0.19, depth=0.05, folds=17, rows=41, columns=80, fabric=cotton
     )
     sleeves = [
         robes.sleeve_bell(
-            rig, s, lie_on, skin.weights, start=0.055, past_wrist=0.0, drop=0.27, width=0.035, fabric=cotton, columns=36
+            rig, s, lie_on, skin.weights, start=0.055, past_wrist=0.0, drop=0.27, width=0.035, fabric=cotton, columns=34
         )
         for s in ("Left", "Right")
     ]

@@ -103,7 +103,7 @@ def look() -> assembly.AvatarMesh:
     belt = cords.rope_belt(
         around, trunk, skin.weights[skin.weights[:, arms].sum(1) < 0.5], radius=_ROPE_RADIUS, rows=72, columns=6
     )
-    skirt = robes.long_skirt(rig, trunk, top=waist, bottom=0.075, depth=0.06, rows=40, columns=80)
+    skirt = robes.long_skirt(rig, trunk, top=waist, bottom=0.075, depth=0.052, rows=42, columns=82)
     skirt = _above(skirt, 0.1)
     for x, length in ((0.035, 0.46), (0.062, 0.56)):
         skirt = _rope_end(skirt, x, waist, length)
@@ -111,9 +111,9 @@ def look() -> assembly.AvatarMesh:
         robes.sleeve_bell(rig, s, lie_on, skin.weights, start=0.075, drop=0.21, rows=24, columns=36)
         for s in ("Left", "Right")
     ]
-    hood = hoods.hood(rig, lie_on, skin.weights, collar=cut.bodice.neck - 0.012, rows=26, columns=42)
-    string = cords.necklace(rig, lie_on, collar=cut.bodice.neck + 0.004, radius=0.014, depth=0.27)
+    string = cords.necklace(rig, lie_on, collar=cut.bodice.neck - 0.006, radius=0.014, depth=0.27)
     beads = cords.beads(string, skin.vertices, skin.weights, rows=5, columns=6)
+    hood = hoods.hood(rig, lie_on, skin.weights, collar=cut.bodice.neck - 0.026)
     sandals = [footwear.sandal(rig, s, skin.vertices, skin.weights, thickness=_SOLE) for s in ("Left", "Right")]
 
     layers = [

@@ -100,6 +100,16 @@ def even(line: Float[np.ndarray, "n 3"], count: int, *, closed: bool = False) ->
     return np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
 
 
+def even_grid(rows: Float[np.ndarray, "r n 3"], hem: int = 1, rounds: int = 3) -> Float[np.ndarray, "r n 3"]:
+    """The sheet with its vertices moved within it: evenly spaced down each column and, above the last `hem` rows, along
+    each row."""
+    rows = rows.copy()
+    for _ in range(rounds):
+        rows[:-hem] = np.stack([even(row, len(row)) for row in rows[:-hem]])
+        rows = np.stack([even(column, len(rows)) for column in rows.transpose(1, 0, 2)], axis=1)
+    return rows
+
+
 def walked(rows: Float[np.ndarray, "r n 3"]) -> Float[np.ndarray, "r n"]:
     """Metres along each column from the first row."""
     steps = np.linalg.norm(np.diff(rows, axis=0), axis=-1)

@@ -62,9 +62,9 @@ def sandal(
             rows.append(row)
         faces, uvs = grid_faces(len(rows), columns, closed=True)
         points.append(np.concatenate(rows))
-        face_lists.append(faces[:, ::-1] + count)
+        face_lists.append(faces + count)
         low = 0.52 if at > 0.1 else 0.77
-        uv_lists.append(uvs[:, ::-1] * np.array([1, 0.22]) + np.array([0, low]))
+        uv_lists.append(uvs * np.array([1, 0.22]) + np.array([0, low]))
         count += len(rows) * columns
     vertices = np.concatenate(points).astype(np.float32)
     return Piece(

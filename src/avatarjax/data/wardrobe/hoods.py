@@ -22,10 +22,10 @@ def hood(
     collar: float,
     stand: float = 0.04,
     length: float = 0.3,
-    spread: float = 2.15,
+    spread: float = 1.95,
     fabric: Fabric = fabrics.WOOL,
-    rows: int = 26,
-    columns: int = 56,
+    rows: int = 22,
+    columns: int = 40,
 ) -> Piece:
     """A hood that is down: from the collar at height `collar` it stands up around the neck, rolls over and falls to a
     point on the back.
@@ -44,7 +44,7 @@ def hood(
     for _ in range(6):
         height, _ = lie_on.height(ring)
         ring -= out * np.clip(height - 0.003, -0.02, 0.02)[:, None]
-    fade = 1 - 0.75 * front
+    fade = 1 - 0.5 * front
     # Up around the neck and over, an arch in the plane of the ray.
     share = np.linspace(0, 1, 9)[:, None, None]
     arch = np.sin(np.pi * 0.62 * share) / np.sin(np.pi * 0.5)
@@ -58,7 +58,7 @@ def hood(
 
     def pull(p: np.ndarray, gone: np.ndarray) -> np.ndarray:
         # A hood hangs to a point: its sides are drawn in to the middle of the back.
-        inward = -p[:, :1] * np.array([1.0, 0, 0]) * (2.0 * behind * smoothstep(gone, 0.02, 0.2))[:, None]
+        inward = -p[:, :1] * np.array([1.0, 0, 0]) * (1.2 * behind * smoothstep(gone, 0.02, 0.2))[:, None]
         away = out * ((0.2 + 0.35 * behind) * np.exp(-gone / 0.04) + 0.05)[:, None]
         return away - _UP + inward
 
@@ -71,8 +71,7 @@ def hood(
     points = points + puff[..., None] * normal.reshape(points.shape)
     for _ in range(3):
         points[2:-1] = (points[1:-2] + 2 * points[2:-1] + points[3:]) / 4
-    points = lie_on.clear(points[1:].reshape(-1, 3), 0.009).reshape(rows - 1, columns, 3)
-    points = np.concatenate([ring[None], points])
+    points = _tidy(np.concatenate([ring[None], points[1:]]), lie_on, 0.01)
     faces, uvs = grid_faces(rows, columns, closed=False)
     gone = drape.walked(points)
     reach = 1.3 * np.clip(gone - gone[2], 0, None)
@@ -80,7 +79,7 @@ def hood(
     vertices = points.reshape(-1, 3).astype(np.float32)
     # The roll keeps its bulge: across it, the rising side is tied to the falling one.
     index = np.arange(rows * columns).reshape(rows, columns)
-    braces = np.concatenate([np.stack([index[a, 4:-4], index[b, 4:-4]], 1) for a, b in ((2, 12), (3, 10), (4, 14))])
+    braces = np.concatenate([np.stack([index[a, 4:-4], index[b, 4:-4]], 1) for a, b in ((2, 9), (3, 8), (3, 11))])
     carried = nearest_weights(vertices, lie_on.points, weights)
     return Piece("hood", vertices, faces, uvs, carried, reach.ravel().astype(np.float32), braces, fabric, False)
 
@@ -94,7 +93,7 @@ def veil(
     tilt: float = 0.2,
     spread: float = 1.45,
     gap: float = 0.014,
-    tatter: float = 0.1,
+    tatter: float = 0.05,
     fabric: Fabric = fabrics.SILK,
     rows: int = 52,
     columns: int = 48,
@@ -108,7 +107,7 @@ def veil(
     up = np.stack([np.sin(turn), np.cos(turn) * np.cos(tilt), -np.cos(turn) * np.sin(tilt)], axis=1)
     band = drape.outward(lie_on.points[lie_on.points[:, 1] > centre[1] - 0.1], centre, up)
     band = lie_on.clear(drape.even(band, columns) + 0.004 * up, 0.006)
-    torn = 0.5 * np.sin(turn * 9 + 0.6) + 0.35 * np.sin(turn * 17 + 2.1) + 0.35 * np.sin(turn * 31)
+    torn = 0.5 * np.sin(turn * 9 + 0.6) + 0.35 * np.sin(turn * 17 + 2.1) + 0.35 * np.sin(turn * 23)
     lengths = length - 0.5 * np.abs(centre[1] + 0.12 - band[:, 1]) + tatter * length * (torn - 0.3)
 
     def pull(p: np.ndarray, gone: np.ndarray) -> np.ndarray:
@@ -125,7 +124,7 @@ def veil(
     points = points + fold[..., None] * level / np.maximum(np.linalg.norm(level, axis=-1, keepdims=True), 0.3)
     for _ in range(2):
         points[3:-1] = (points[2:-2] + 2 * points[3:-1] + points[4:]) / 4
-    points[3:] = lie_on.clear(points[3:].reshape(-1, 3), 0.8 * gap).reshape(rows - 3, columns, 3)
+    points = _tidy(points, lie_on, 0.8 * gap)
     faces, uvs = grid_faces(rows, columns, closed=False)
     faces, uvs = faces[:, ::-1].copy(), uvs[:, ::-1].copy()
     vertices = points.reshape(-1, 3).astype(np.float32)
@@ -148,7 +147,7 @@ def front_hair(
     gap: float = 0.012,
     fabric: Fabric = fabrics.HAIR,
     rows: int = 40,
-    columns: int = 20,
+    columns: int = 18,
 ) -> Piece:
     """Long hair on one side (Left or Right) of a parting in the middle of the head (around `centre`), which falls to
     the front of the shoulder.
@@ -174,11 +173,12 @@ def front_hair(
         return np.stack([(aside + inward) * sign, -np.ones(columns), ahead], axis=1)
 
     ragged = 1 + 0.04 * np.sin(share * 23) + 0.03 * np.sin(share * 41 + 1)
-    lengths = length * ragged * (1 - 0.1 * share)
+    # The way over the crown is longer than that from the forehead.
+    lengths = length * ragged + 1.2 * (roots[:, 1] - roots[0, 1]) + 0.05 * share
     points = drape.fall(roots, lengths, rows, lie_on, pull=pull, gap=gap, ease=3, smooth=0.3)
     for _ in range(2):
         points[3:-1] = (points[2:-2] + 2 * points[3:-1] + points[4:]) / 4
-    points[3:] = lie_on.clear(points[3:].reshape(-1, 3), 0.8 * gap).reshape(rows - 3, columns, 3)
+    points = _tidy(points, lie_on, 0.8 * gap)
     gone = drape.walked(points)
     faces, uvs = grid_faces(rows, columns, closed=False)
     if side == "Right":
@@ -189,6 +189,15 @@ def front_hair(
     weights = _head_then_chest(rig, vertices)
     name = side.lower() + " hair"
     return Piece(name, vertices, faces, uvs, weights, reach.ravel().astype(np.float32), fabric=fabric, solid=False)
+
+
+def _tidy(points: np.ndarray, lie_on: drape.Ground, gap: float) -> np.ndarray:
+    """The sheet (r, n, 3) evenly meshed and, from its fourth row on, `gap` clear of the ground."""
+    gaps = np.repeat(gap * np.minimum(np.arange(len(points)) / 3, 1.0), points.shape[1])
+    for _ in range(3):
+        points = lie_on.clear(points.reshape(-1, 3), gaps).reshape(points.shape)
+        points = drape.even_grid(points, rounds=1)
+    return points
 
 
 def _head_then_chest(rig: Rig, vertices: np.ndarray) -> np.ndarray:

@@ -137,9 +137,11 @@ def sleeve_bell(
             height, normal = clear_of.height(points[i])
             points[i] -= normal * np.clip(height - 0.004 * i, 0, 0.03)[:, None]
         points[i] = clear_of.clear(points[i], 0.75 * margin * min(1.0, (i + 2) / 7))
+        points[i] = drape.even(points[i], columns, closed=True)
     faces, uvs = grid_faces(rows, columns, closed=True)
     if side == "Left":
         faces, uvs = faces[:, ::-1].copy(), uvs[:, ::-1].copy()
+    points[1:] = np.stack([drape.even(column, rows - 1) for column in points[1:].transpose(1, 0, 2)], axis=1)
     down = drape.walked(points)
     reach = 1.3 * np.clip(down - down[1], 0, None)
     vertices = points.reshape(-1, 3).astype(np.float32)
