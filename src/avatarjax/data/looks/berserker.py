@@ -154,7 +154,10 @@ def _wild_hair(rig: capes.Rig, cut: _Cut, skin: Piece, collar: Piece, bottom: fl
             away = np.arctan2(places[:, 0], -places[:, 2]) - turn
             chosen.append(head[np.argmin(np.abs(away) * 0.09 + np.abs(places[:, 1] - eye[1] - height))])
     chosen = np.array(chosen)
-    return beards.locks(rig, skin.vertices[chosen], normals[chosen], tailoring.Ground.of([skin, collar]), bottom=bottom)
+    behind = float(collar.vertices[:, 2].min())
+    return beards.locks(
+        rig, skin.vertices[chosen], normals[chosen], tailoring.Ground.of([skin, collar]), bottom=bottom, behind=behind
+    )
 
 
 def _bracer(rig: capes.Rig, shell: Piece, side: float) -> Piece:
@@ -179,7 +182,11 @@ def _thicken(skin: Piece, cut: _Cut) -> Piece:
     scalp, beard = cut.scalp(p), makeup.beard_area(cut.face, p)
     normals = assembly.vertex_normals(skin.vertices, skin.faces)
     wild = scalp * (0.02 + 0.008 * noise(p * np.array([1, 1, 0.5]), 0.02, 23))
-    thick = 0.006 * cut.harness(p) + wild + beard * (0.012 + 0.004 * noise(p * np.array([1, 0.4, 1]), 0.012, 24))
+    grown = beard * (0.012 + 0.004 * noise(p * np.array([1, 0.4, 1]), 0.012, 24))
+    # Not on the ears, whose folds would turn inside out.
+    back, y = cut.face.eye[2] - p[:, 2], p[:, 1] - cut.face.eye[1]
+    ear = makeup.blob((back - 0.096) / 0.045, (y + 0.016) / 0.05, 0.7) * smoothstep(np.abs(p[:, 0]), 0.058, 0.068)
+    thick = 0.006 * cut.harness(p) + (wild + grown) * (1 - ear)
     return dataclasses.replace(skin, vertices=(skin.vertices + normals * thick[:, None]).astype(np.float32))
 
 

@@ -202,6 +202,7 @@ def locks(
     ground: Ground,
     *,
     bottom: float,
+    behind: float,
     radius: float = 0.021,
     sewn: float = 0.05,
     margin: float = 0.008,
@@ -211,8 +212,8 @@ def locks(
 ) -> Piece:
     """Thick locks of wild hair, one tube from each root (k, 3) on the scalp, where the skin faces `outward` (k, 3).
 
-    They part from the head by their thickness, `radius` metres, and hang over the ground to about height `bottom`;
-    no two are alike, but the same every time. The first `sewn` metres do not swing.
+    They part from the head by their thickness, `radius` metres, and hang over the ground to about height `bottom`, at
+    z = `behind` or nearer; no two are alike, but the same every time. The first `sewn` metres do not swing.
     """
     rng = np.random.default_rng(seed)
     tubes = []
@@ -222,15 +223,13 @@ def locks(
         sway = 0.012 * rng.normal(size=(3, 3)) * np.array([1, 0.3, 1])
         thick = radius * rng.uniform(0.85, 1.2)
         start = root - 0.006 * out
-        knots = np.array(
-            [
-                start,
-                start + level * thick + np.array([0, -0.02, 0]),
-                start * [1, 0.65, 1] + level * 1.4 * thick + sway[0] + np.array([0, 0.35 * low, 0]),
-                start * [1, 0.3, 1] + level * 1.8 * thick + sway[1] + np.array([0, 0.7 * low, 0]),
-                start * [1, 0, 1] + level * 2.2 * thick + sway[2] + np.array([0, low, 0]),
-            ]
-        )
+        # They fall to the back, and not onto the shoulders.
+        tip = np.array([0.95 * start[0], low, min(start[2], behind)])
+        knots = [start, start + level * thick + np.array([0, -0.02, 0])]
+        for k, share in enumerate((0.4, 0.75, 1.0)):
+            back = np.array([share, share, share**0.8])
+            knots.append(start + back * (tip - start) + (1.2 + share) * thick * level + sway[k])
+        knots = np.array(knots)
         path = path_through(knots, rows)
         s = np.linspace(0, 1, rows)
         girth = thick * np.interp(s, [0, 0.15, 0.5, 0.85, 1], [0.75, 1.0, 1.05, 0.6, 0.16])
@@ -254,7 +253,7 @@ def locks(
     reach = np.concatenate([t.reach for t in tubes if t.reach is not None])
     # Where a tube as a whole went astray between two surfaces, its own vertices give way.
     free = reach > 0
-    vertices[free] = ground.hold_clear(vertices[free], 0.0065, rounds=5)
+    vertices[free] = ground.hold_clear(vertices[free], 0.011, rounds=5)
     return Piece(
         "hair",
         vertices,

@@ -66,7 +66,7 @@ def cape(
     bottom: float,
     half_top: float = 0.175,
     half_bottom: float = 0.36,
-    margin: float = 0.016,
+    margin: float = 0.024,
     folds: int = 9,
     fabric: Fabric = fabrics.WOOL,
     rows: int = 42,

@@ -150,15 +150,15 @@ def backpack(rig: Rig, under: Piece, *, centre: Float[np.ndarray, "3"], bone: st
     (0.6, 0.3, 1, 0.7), straps (0.6, 0, 0.8, 0.3) and (0.8, 0, 1, 0.3).
     """
 
-    def box(at: tuple[float, float, float], half: tuple[float, float, float], **kind: float) -> Piece:
-        return rounded_box(rig, "bag", bone, centre + np.array(at), np.array(half), rows=10, columns=20, **kind)
+    def box(at: tuple[float, float, float], half: tuple[float, float, float]) -> Piece:
+        return rounded_box(rig, "bag", bone, centre + np.array(at), np.array(half), rows=10, columns=20)
 
     bag = rounded_box(rig, "bag", bone, centre, np.array([0.15, 0.19, 0.085]), rows=16, columns=30)
-    lid = box((0, 0.165, -0.004), (0.157, 0.045, 0.1))
+    lid = box((0.0, 0.165, -0.004), (0.157, 0.045, 0.1))
     parts = [
         (bag, (0.0, 0.4, 0.6, 1.0)),
         (lid, (0.6, 0.7, 1.0, 1.0)),
-        (box((0, -0.075, -0.088), (0.1, 0.085, 0.035)), (0.0, 0.1, 0.3, 0.4)),
+        (box((0.0, -0.075, -0.088), (0.1, 0.085, 0.035)), (0.0, 0.1, 0.3, 0.4)),
         (box((0.155, -0.075, -0.01), (0.032, 0.09, 0.06)), (0.3, 0.1, 0.45, 0.4)),
         (box((-0.155, -0.075, -0.01), (0.032, 0.09, 0.06)), (0.45, 0.1, 0.6, 0.4)),
         (roll(rig, bone, centre + np.array([0, 0.265, -0.01]), 0.44, 0.064), (0.6, 0.3, 1.0, 0.7)),
