@@ -111,7 +111,7 @@ def look() -> assembly.AvatarMesh:
         robes.sleeve_bell(rig, s, lie_on, skin.weights, start=0.075, drop=0.21, rows=24, columns=36)
         for s in ("Left", "Right")
     ]
-    string = cords.necklace(rig, lie_on, collar=cut.bodice.neck - 0.006, radius=0.014, depth=0.27)
+    string = cords.necklace(rig, lie_on, collar=cut.bodice.neck + 0.001, radius=0.014, depth=0.27)
     beads = cords.beads(string, skin.vertices, skin.weights, rows=5, columns=6)
     hood = hoods.hood(rig, lie_on, skin.weights, collar=cut.bodice.neck - 0.026)
     sandals = [footwear.sandal(rig, s, skin.vertices, skin.weights, thickness=_SOLE) for s in ("Left", "Right")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
@@ -49,7 +50,9 @@ def ground(*surfaces: tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]])
     return Ground(points, normals, cKDTree(points))
 
 
-def outward(points: Float[np.ndarray, "v 3"], centre: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]):
+def outward(
+    points: Float[np.ndarray, "v 3"], centre: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
     """Where rays from a centre along unit directions leave a round cloud of points (a head): (n, 3), metres."""
     offset = points - centre
     length = np.linalg.norm(offset, axis=1)
@@ -64,7 +67,7 @@ def fall(
     rows: int,
     lie_on: Ground,
     *,
-    pull,
+    pull: Callable[[np.ndarray, np.ndarray], np.ndarray],
     gap: float = 0.01,
     ease: int = 3,
     smooth: float = 0.5,

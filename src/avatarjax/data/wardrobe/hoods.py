@@ -172,7 +172,7 @@ def front_hair(
         inward = -0.3 * smoothstep(gone, 0.2, 0.3) * smoothstep(x - temple - 0.085 * share, 0.0, 0.05)
         return np.stack([(aside + inward) * sign, -np.ones(columns), ahead], axis=1)
 
-    ragged = 1 + 0.04 * np.sin(share * 23) + 0.03 * np.sin(share * 41 + 1)
+    ragged = 1 + 0.03 * np.sin(share * 12) + 0.015 * np.sin(share * 19 + 1)
     # The way over the crown is longer than that from the forehead.
     lengths = length * ragged + 1.2 * (roots[:, 1] - roots[0, 1]) + 0.05 * share
     points = drape.fall(roots, lengths, rows, lie_on, pull=pull, gap=gap, ease=3, smooth=0.3)

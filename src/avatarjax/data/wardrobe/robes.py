@@ -102,7 +102,9 @@ def sleeve_bell(
     clear_of = drape.ground((lie_on.points[palm], lie_on.normals[palm]))
     angles = np.arange(columns) * 2 * np.pi / columns
     rings = []
-    for share in np.linspace(0, 1, rows):
+    shares = np.linspace(0, 1, rows)
+    gaps = 0.002 + (margin - 0.002) * smoothstep(shares, 0.0, 0.12)
+    for share, gap in zip(shares, gaps, strict=True):
         s = start + share * (wrist + past_wrist - start)
         centre = np.array([np.interp(s, along, path[:, k]) for k in range(3)])
         axis = np.array([np.interp(s, along, tangents[:, k]) for k in range(3)])
@@ -116,7 +118,6 @@ def sleeve_bell(
         near = np.abs(offset @ axis) < 0.022
         flat = np.stack([offset[near] @ across, offset[near] @ hang], axis=1)
         flat = flat[np.linalg.norm(flat, axis=1) < 0.13]
-        gap = 0.002 + (margin - 0.002) * smoothstep(np.asarray(share), 0.0, 0.12)
         fitted = outline(flat, np.zeros(2), angles) + gap
         wide = fitted * np.sin(angles) * (1 + width * share / 0.06 * (1 + 0.5 * np.cos(angles)))
         low = fitted * np.cos(angles) + drop * share**1.4 * smoothstep(np.cos(angles), -0.6, 0.9)
