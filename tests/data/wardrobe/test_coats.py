@@ -23,7 +23,7 @@ def coat(figure):
 
 def test_the_coat_is_outside_the_skin_between_waist_and_wrists(figure, coat):
     rig, skin, _ = figure
-    # In the armpits, where the relaxed shell bridges the fold, it comes close to the skin.
+    # But for the armpits, where the shell bridges a fold.
     assert np.percentile(tailoring.Ground.of([skin]).clearance(coat.vertices)[0], 3) > 0.008
     assert 1.03 < coat.vertices[:, 1].min() < 1.07
     assert coats.sleeve_end(rig, coat.vertices.astype(np.float64), 0.012).min() > -0.02

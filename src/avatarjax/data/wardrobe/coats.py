@@ -60,7 +60,8 @@ def coat_top(
     before = sleeve_end(rig, q.astype(np.float64), 0.012)
     cuff = smoothstep(before, 0.075, 0.06) * smoothstep(before, -0.02, 0.0)
     thick = thickness - 0.004 * smoothstep(before, 0.3, 0.1) + 0.005 * cuff
-    top = tailoring.let_out(top, thick, smooth=0.5, rounds=10)
+    # More rounds would make the sleeves as thin as the arms in them.
+    top = tailoring.let_out(top, thick, smooth=0.5, rounds=4)
     return dataclasses.replace(tailoring.spread_uvs(top), name="coat", fabric=fabric)
 
 
