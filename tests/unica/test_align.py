@@ -20,23 +20,6 @@ def cloud(points, key):
     return Gaussians(points, jax.random.normal(b, (60, 3)) - 4, quats, jnp.zeros(60), jnp.full((60, 3), 0.5))
 
 
-def test_boxed_points_fill_the_cube_along_the_longest_axis(points):
-    boxed = np.asarray(align.into_box(align.bounding_box(points), points))
-    np.testing.assert_allclose(boxed.min(0), -boxed.max(0), atol=1e-6)
-    assert np.ptp(boxed, axis=0).max() == pytest.approx(1, abs=1e-6)
-
-
-def test_the_box_can_be_undone(points):
-    box = align.bounding_box(points)
-    np.testing.assert_allclose(align.into_box(box, points) * box.side + box.centre[None], points, atol=1e-5)
-
-
-def test_boxed_points_do_not_know_place_and_size(points):
-    boxed = align.into_box(align.bounding_box(points), points)
-    moved = 3 * points + jnp.array([[10.0, 20.0, -5.0]])
-    np.testing.assert_allclose(align.into_box(align.bounding_box(moved), moved), boxed, atol=1e-5)
-
-
 def test_placing_finds_a_known_similarity(cloud):
     """Means, covariances and sizes move together."""
     rotation = np.asarray(rotations.to_matrix(rotations.from_axis_angle(jnp.array([0.3, -1.2, 0.5]))), np.float64)

@@ -1,15 +1,22 @@
-"""One avatar's training data in a folder: built once, checked when it is read, never half there.
+"""One avatar's training data in a folder: built clip by clip, checked when it is read, never half there.
 
-The manifest is written last and lists every file's size and SHA-256: a folder without one is unfinished, and a file
-that does not fit it is named.
+    manifest.json                     what it was made of, and every file's size and SHA-256; written last
+    avatar.safetensors                faces, uvs, rest vertices, skinning weights, atlas, standing pose
+    texture.png
+    clips/train-000.safetensors       texels, roots, actions, joint rotations and, if asked for, all vertices
+    images/train/00000_07.png         pose 0 from view 7, straight alpha; images/train.safetensors says which pose
+
+A build that was interrupted goes on where it stopped: a clip's file is written after everything else of the clip.
 """
 
 from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
-import hashlib
+import functools
 import json
+import shutil
+import threading
 import typing
 from pathlib import Path
 
@@ -22,38 +29,51 @@ from tqdm import tqdm
 
 from avatarjax import cameras, posmap
 from avatarjax.cameras import Camera
-from avatarjax.data import avatars, sequences
+from avatarjax.data import avatars, dressing, manifest, sequences
 from avatarjax.data.mesh_renderer import MeshRenderer
-from avatarjax.data.sequences import Recording
-from avatarjax.io import atomic, weights
+from avatarjax.data.sequences import Recording, Take
+from avatarjax.io import atomic, exr, weights
+from avatarjax.physics.xpbd import XPBDConfig
 
-VERSION = 2
+VERSION = 3
 VIEWS = 50  # on the cylinder (UNICA B.1)
-LEAD_IN = 15  # idle frames before the report's script
+SPLITS = ("train", "held_out", "truth")
+_AGAIN = "build it again with --stage data"
+_NOTE = "building.json"  # lies beside what an unfinished build has made
 _GOLDEN = np.pi * (3 - np.sqrt(5))
+# Simulating and rendering release the interpreter: so many clips at a time keep two cores busy.
+_WORKERS = 2
 
 
 @dataclasses.dataclass(frozen=True)
 class DatasetSpec:
-    """What a dataset is made of; two datasets with equal specs are equal."""
+    """What a dataset is made of; two datasets with equal specs are equal.
+
+    Sequences have `transition_frames` frames, or those of UNICA Table A for None. `vertices` says whether whole meshes
+    are kept, as float16 or float32 relative to the root, and not only the texels of the position maps.
+    """
 
     avatar: str
     size: int
     upscaled: int
-    transition_frames: int
-    held_out_frames: int
+    transition_frames: int | None
+    held_out_frames: int | None
     image_poses: int
     image_views: int
     standing_views: int
     image_size: int
     script: tuple[int, ...]
     seed: int = 0
+    cloth_steps: int = 20
+    vertices: typing.Literal["none", "float16", "float32"] = "none"
 
     def __post_init__(self):
         if not 1 <= self.image_views <= VIEWS or not 1 <= self.standing_views <= VIEWS:
             raise ValueError(
                 f"there are 1 to {VIEWS} views a pose, asked for {self.image_views} and {self.standing_views}"
             )
+        if self.vertices not in ("none", "float16", "float32"):
+            raise ValueError(f"vertices are kept as none, float16 or float32, not {self.vertices!r}")
 
 
 @typing.no_type_check
@@ -86,9 +106,6 @@ class Dataset:
     held_out_images: Images
 
 
-_FILES = {f"{field.name}.safetensors" for field in dataclasses.fields(Dataset)}
-
-
 def cylinder_cameras(size: int) -> Camera:
     """The 50 cameras of UNICA B.1, on a cylinder about the unit cube of a normalised pose, square pictures.
 
@@ -99,104 +116,170 @@ def cylinder_cameras(size: int) -> Camera:
     return cameras.orbit(k * _GOLDEN, target=(0, 0, 0), distance=1.75, heights=heights, width=size, height=size)
 
 
-def build(folder: Path, spec: DatasetSpec, *, progress: bool = True) -> None:
-    """Simulate, encode and render the dataset; several minutes at paper scale. An older one in `folder` is replaced."""
-    folder = Path(folder)
-    (folder / "manifest.json").unlink(missing_ok=True)
-    avatar = avatars.build(spec.avatar)
-    atlas = posmap.build_atlas(avatars.a_pose(avatar), avatar.faces, spec.size)
-    standing_vertices = avatars.standing_pose(avatar)
-    standing = posmap.encode(atlas, jnp.asarray(standing_vertices))
+@dataclasses.dataclass(frozen=True)
+class _Plan:
+    """The sequences of a split, and which of their poses are pictured: (sequence, frame) and views (p, k)."""
 
-    plans = {
-        "train": sequences.transition_scripts(spec.transition_frames, spec.seed),
-        "held_out": sequences.transition_scripts(spec.held_out_frames, spec.seed + 1),
-        # The controller begins in steady motion: from standing, as a rollout does, takes a moment of idling first.
-        "truth": np.asarray([(0,) * LEAD_IN + spec.script], np.int32),
-    }
+    scripts: list[np.ndarray]
+    headings: np.ndarray
+    poses: list[tuple[int, int]]
+    views: np.ndarray
+
+
+def _plans(spec: DatasetSpec) -> dict[str, _Plan]:
     rng = np.random.default_rng(spec.seed + 3)
-    headings = {name: rng.integers(0, 4, len(scripts)) * (np.pi / 2) for name, scripts in plans.items()}
-    headings["truth"] = np.zeros(1)
-    motions = sequences.simulate(avatar, plans, headings, spec.seed)
-    recordings = {}
-    for name in tqdm(plans, desc="position maps", unit="set", disable=not progress):
-        recordings[name] = sequences.record(avatar, atlas, plans[name], motions[name])
-    recordings["truth"] = jax.tree.map(lambda x: x[LEAD_IN:], recordings["truth"])
-
-    painter = _Painter(avatar, atlas, spec)
-    tables: dict[str, typing.Any] = {"atlas": atlas, **recordings, "standing": {"texels": standing}}
-    root = posmap.root(atlas, standing)
-    tables["standing_images"] = painter.paint(
-        np.asarray(standing - root[None])[None],
-        lambda _: standing_vertices - np.asarray(root),
-        np.arange(spec.standing_views)[None],
-        "standing pose",
-        progress,
-    )
-    for name, poses in (("train", spec.image_poses), ("held_out", max(8, spec.image_poses // 6))):
-        recording, motion = recordings[name], motions[name]
-        length = motion.headings.shape[1]
-        chosen = np.sort(rng.choice(len(recording.actions), min(poses, len(recording.actions)), replace=False))
-        views = np.stack([rng.permutation(VIEWS)[: spec.image_views] for _ in chosen])
-
-        def vertices(k, chosen=chosen, motion=motion, recording=recording, length=length):
-            sequence, frame = divmod(int(chosen[k]), length)
-            world = sequences.vertices_of(avatar, motion, sequence, slice(frame, frame + 1))[0]
-            return world - recording.roots[chosen[k]]
-
-        tables[f"{name}_images"] = painter.paint(
-            recording.texels[chosen], vertices, views, f"{name.replace('_', '-')} pictures", progress
-        )
-    _write(folder, spec, tables)
+    plans = {}
+    frames = {"train": spec.transition_frames, "held_out": spec.held_out_frames}
+    for offset, name in enumerate(SPLITS):
+        if name in frames:
+            scripts = sequences.transition_scripts(frames[name], spec.seed + offset)
+            headings = rng.integers(0, 4, len(scripts)) * (np.pi / 2)
+            wanted = spec.image_poses if name == "train" else max(8, spec.image_poses // 6)
+        else:
+            scripts, headings, wanted = [np.asarray(spec.script, np.int32)], np.zeros(1), 0
+        frame = [(k, f) for k, script in enumerate(scripts) for f in range(len(script))]
+        chosen = np.sort(rng.choice(len(frame), min(wanted, len(frame)), replace=False))
+        views = np.array([rng.permutation(VIEWS)[: spec.image_views] for _ in chosen], np.int32)
+        plans[name] = _Plan(scripts, headings, [frame[k] for k in chosen], views)
+    return plans
 
 
-class _Painter:
-    """Renders poses in the box of their upscaled points, where the appearance network works."""
+def build(folder: Path, spec: DatasetSpec, *, progress: bool = True) -> None:
+    """Simulate, encode and render the dataset into `folder`; several minutes at paper scale.
 
-    def __init__(self, avatar: avatars.AvatarMesh, atlas: posmap.Atlas, spec: DatasetSpec):
-        self.renderer = MeshRenderer(avatar.faces, avatar.uvs, avatar.texture)
+    Goes on where an earlier build with the same spec was interrupted; anything else in the folder is replaced.
+    """
+    folder = Path(folder)
+    _begin(folder, spec)
+    maker = _Maker(folder, spec, progress)
+    plans = _plans(spec)
+    total = sum(len(script) + sequences.LEAD_IN for plan in plans.values() for script in plan.scripts)
+    with tqdm(total=total, desc="clips", unit="frame", disable=not progress) as bar:
+        lock = threading.Lock()
+
+        def advance(frames: int) -> None:
+            with lock:
+                bar.update(frames)
+
+        with concurrent.futures.ThreadPoolExecutor(_WORKERS) as pool:
+            jobs = []
+            for offset, (name, plan) in enumerate(plans.items()):
+                # The report's script begins from standing, as a rollout does.
+                lead = 0 if name == "truth" else None
+                motions = sequences.simulate(maker.avatar, plan.scripts, plan.headings, spec.seed + 100 * offset, lead)
+                for k, motion in enumerate(motions):
+                    jobs.append(pool.submit(maker.clip, name, plan, k, motion, advance))
+            try:
+                for job in concurrent.futures.as_completed(jobs):
+                    job.result()
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+    for name, plan in plans.items():
+        if plan.poses:
+            index = {"sequence": [p[0] for p in plan.poses], "frame": [p[1] for p in plan.poses], "view": plan.views}
+            weights.save_tree(_table(folder, name), {k: np.asarray(v, np.int32) for k, v in index.items()})
+    note = folder / _NOTE
+    files = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file() and p != note)
+    clips = {name: [len(script) for script in plan.scripts] for name, plan in plans.items()}
+    content = {"spec": dataclasses.asdict(spec), "actions": sequences.ACTIONS, "clips": clips}
+    manifest.write(folder, VERSION, files, **content)
+    note.unlink()
+
+
+def _begin(folder: Path, spec: DatasetSpec) -> None:
+    """Leave in the folder only what an interrupted build of the same spec has finished."""
+    folder.mkdir(parents=True, exist_ok=True)
+    note = folder / _NOTE
+    wanted = json.dumps({"version": VERSION, "spec": dataclasses.asdict(spec)})
+    if (folder / manifest.NAME).exists() or not note.is_file() or note.read_text(encoding="utf-8") != wanted:
+        for name in (manifest.NAME, _NOTE, "avatar.safetensors", "texture.png"):
+            (folder / name).unlink(missing_ok=True)
+        for name in ("clips", "images"):
+            shutil.rmtree(folder / name, ignore_errors=True)
+        for path in folder.glob("*.safetensors"):
+            path.unlink()
+        atomic.write_text(note, wanted)
+    for path in folder.rglob(".*"):
+        path.unlink()  # what a killed process was writing
+
+
+class _Maker:
+    """Makes clips and pictures of one avatar; poses are pictured in the box of their upscaled points, where the
+    appearance network works."""
+
+    def __init__(self, folder: Path, spec: DatasetSpec, progress: bool):
+        self.folder, self.spec = folder, spec
+        self.avatar = avatars.build(spec.avatar)
+        self.cloth = XPBDConfig(substeps=spec.cloth_steps)
+        path = folder / "avatar.safetensors"
+        if path.is_file():
+            arrays = weights.load_arrays(path)[0]
+            self.atlas, standing = _atlas(arrays, spec.size), arrays["standing_vertices"]
+        else:
+            reference = dressing.settle(self.avatar, avatars.a_pose(self.avatar.rig), self.cloth)
+            self.atlas = posmap.build_atlas(reference, self.avatar.faces, spec.size)
+            standing = dressing.settle(self.avatar, avatars.standing_pose(self.avatar.rig), self.cloth)
+        self.renderer = MeshRenderer(self.avatar.faces, self.avatar.uvs, self.avatar.texture)
         self.cameras = cylinder_cameras(spec.image_size)
-        upscaler = posmap.build_upscaler(atlas, spec.upscaled)
-        self.points = jax.jit(lambda texels: posmap.upscale(upscaler, texels))
+        upscaler = posmap.build_upscaler(self.atlas, spec.upscaled)
+        self.box = jax.jit(lambda texels: posmap.bounding_box(posmap.upscale(upscaler, texels)))
+        if not path.is_file():
+            self._describe(path, standing, progress)
 
-    def paint(self, texels, vertices, views, label: str, progress: bool) -> Images:
-        """`vertices(k)` gives pose k's mesh in the frame of its `texels` (p, t, 3); `views` (p, k)."""
-        poses, count = views.shape
-        rgba = np.zeros((poses, count, self.cameras.height, self.cameras.width, 4), np.uint8)
+    def _describe(self, path: Path, standing: np.ndarray, progress: bool) -> None:
+        texels = posmap.encode(self.atlas, jnp.asarray(standing))
+        root = posmap.root(self.atlas, texels)
+        views = tqdm(range(self.spec.standing_views), desc="standing pose", unit="view", disable=not progress)
+        self.picture("standing", 0, np.asarray(texels - root[None]), standing - np.asarray(root), views)
+        exr.write_png(self.folder / "texture.png", self.avatar.texture)
+        avatar = self.avatar
+        arrays = {
+            "faces": avatar.faces,
+            "uvs": avatar.uvs,
+            "rest": avatar.vertices,
+            "weights": avatar.weights,
+            "parts": avatar.parts,
+            "standing": texels,
+            "standing_vertices": standing,
+            "heads": avatar.rig.heads,
+            "tails": avatar.rig.tails,
+        }
+        atlas = {f"atlas/{f.name}": getattr(self.atlas, f.name) for f in _atlas_fields()}
+        rig = {"joints": avatar.rig.names, "parents": avatar.rig.parents}
+        weights.save_tree(path, {**arrays, **atlas}, part_names=avatar.part_names, **rig)
 
-        def one(k: int) -> None:
-            points = np.asarray(self.points(jnp.asarray(texels[k])))
-            low, high = points.min(0), points.max(0)
-            boxed = (vertices(k) - (low + high) / 2) / (high - low).max()
-            posed = self.renderer.pose(boxed.astype(np.float32))
-            for slot, view in enumerate(views[k]):
-                camera = jax.tree.map(lambda x, v=view: x[v], self.cameras)
-                rgba[k, slot] = posed.render(camera)
+    def clip(self, split: str, plan: _Plan, k: int, motion, advance) -> None:
+        """Simulate sequence k of a split, picture its chosen poses, write it; nothing where that was done before."""
+        path = _clip(self.folder, split, k)
+        if path.is_file():
+            advance(len(motion.headings))
+            return
+        take, vertices = sequences.take(self.avatar, self.atlas, motion, plan.scripts[k], self.cloth, advance)
+        for pose, (sequence, frame) in enumerate(plan.poses):
+            if sequence == k:
+                self.picture(split, pose, take.texels[frame], vertices[frame], plan.views[pose])
+        arrays = {f.name: getattr(take, f.name) for f in dataclasses.fields(Take)}
+        if self.spec.vertices != "none":
+            arrays["vertices"] = vertices.astype(self.spec.vertices)
+        weights.save_tree(path, arrays)
 
-        with concurrent.futures.ThreadPoolExecutor() as pool:
-            done = pool.map(one, range(poses))
-            for _ in tqdm(done, total=poses, desc=label, unit="pose", disable=not progress):
-                pass
-        return Images(np.asarray(texels, np.float32), views.astype(np.int32), rgba)
-
-
-def _write(folder: Path, spec: DatasetSpec, tables: dict[str, typing.Any]) -> None:
-    files = {}
-    for name, tree in tables.items():
-        path = folder / f"{name}.safetensors"
-        weights.save_tree(path, tree)
-        files[path.name] = {"bytes": path.stat().st_size, "sha256": _digest(path)}
-    manifest = {"version": VERSION, "spec": dataclasses.asdict(spec), "actions": sequences.ACTIONS, "files": files}
-    atomic.write_text(folder / "manifest.json", json.dumps(manifest, indent=2))
+    def picture(self, name: str, pose: int, texels: np.ndarray, vertices: np.ndarray, views) -> None:
+        """Write the views of a pose whose `vertices` (v, 3) lie in the frame of its `texels` (t, 3)."""
+        box = self.box(jnp.asarray(texels))
+        posed = self.renderer.pose((vertices - np.asarray(box.centre)) / np.asarray(box.side))
+        for view in views:
+            camera = jax.tree.map(lambda x, v=view: x[v], self.cameras)
+            exr.write_png(_image(self.folder, name, pose, view), posed.render(camera))
 
 
 def matches(folder: Path, spec: DatasetSpec) -> bool:
     """Whether `folder` has a finished dataset of exactly this spec."""
     try:
-        manifest = _manifest(Path(folder))
+        found = _manifest(Path(folder))
     except ValueError:
         return False
-    return manifest["version"] == VERSION and manifest["spec"] == json.loads(json.dumps(dataclasses.asdict(spec)))
+    return found["spec"] == json.loads(json.dumps(dataclasses.asdict(spec)))
 
 
 def load(folder: Path) -> Dataset:
@@ -205,54 +288,72 @@ def load(folder: Path) -> Dataset:
     Raises ValueError that names what is missing, unfinished or damaged, and says how to build it again.
     """
     folder = Path(folder)
-    manifest = _manifest(folder)
-    again = "build it again with --stage data"
-    if manifest["version"] != VERSION:
-        raise ValueError(f"{folder} has data of version {manifest['version']}, this is version {VERSION}: {again}")
-    for name, expected in manifest["files"].items():
-        path = folder / name
-        if not path.is_file():
-            raise ValueError(f"{path} is missing: {again}")
-        if path.stat().st_size != expected["bytes"] or _digest(path) != expected["sha256"]:
-            raise ValueError(f"{path} is damaged (its checksum is not the manifest's): {again}")
+    found = _manifest(folder)
+    manifest.check(folder, found, _AGAIN)
+    arrays = weights.load_arrays(folder / "avatar.safetensors")[0]
+    atlas = _atlas(arrays, int(found["spec"]["size"]))
+    takes = {name: [load_take(folder, name, k) for k in range(len(found["clips"][name]))] for name in SPLITS}
+    standing = jnp.asarray(arrays["standing"])
+    views = np.arange(found["spec"]["standing_views"], dtype=np.int32)[None]
+    centred = np.asarray(standing - posmap.root(atlas, standing)[None])[None]
+    images = {"standing_images": Images(centred, views, _pictures(folder, "standing", views))}
+    for name in ("train", "held_out"):
+        index = weights.load_arrays(_table(folder, name))[0]
+        texels = [takes[name][k].texels[f] for k, f in zip(index["sequence"], index["frame"], strict=True)]
+        images[f"{name}_images"] = Images(np.stack(texels), index["view"], _pictures(folder, name, index["view"]))
+    recordings = {name: sequences.join(takes[name]) for name in SPLITS}
+    return Dataset(atlas=atlas, standing=standing, **recordings, **images)
 
-    def arrays(name):
-        return weights.load_arrays(folder / f"{name}.safetensors")[0]
 
-    atlas = arrays("atlas")
-    size = int(manifest["spec"]["size"])
-    return Dataset(
-        atlas=posmap.Atlas(**{k: jnp.asarray(v) for k, v in atlas.items()}, size=size),
-        standing=jnp.asarray(arrays("standing")["texels"]),
-        **{name: Recording(**arrays(name)) for name in ("train", "held_out", "truth")},
-        **{name: Images(**arrays(name)) for name in ("standing_images", "train_images", "held_out_images")},
-    )
+def load_take(folder: Path, split: str, k: int) -> Take:
+    """One sequence of a split, without its vertices."""
+    arrays = weights.load_arrays(_clip(folder, split, k))[0]
+    return Take(**{f.name: arrays[f.name] for f in dataclasses.fields(Take)})
 
 
 def fingerprint(folder: Path) -> str:
     """A short name of the data's content, by which checkpoints know what they were trained on."""
-    return hashlib.sha256(json.dumps(_manifest(Path(folder))["files"], sort_keys=True).encode()).hexdigest()[:12]
+    return manifest.fingerprint(_manifest(Path(folder)))
 
 
 def _manifest(folder: Path) -> dict[str, typing.Any]:
-    path = folder / "manifest.json"
-    if not path.is_file():
-        raise ValueError(f"{folder} has no finished dataset (no manifest.json): build it with --stage data")
+    found = manifest.read(folder, VERSION, ["avatar.safetensors", "texture.png"], _AGAIN)
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        described = {name: (file["bytes"], file["sha256"]) for name, file in manifest["files"].items()}
-        missing = {"version", "spec"} - manifest.keys() | {"size"} - manifest["spec"].keys() | _FILES - described.keys()
-        if missing:
-            raise KeyError(", ".join(sorted(missing)))
-    except (ValueError, KeyError, AttributeError, TypeError) as error:
-        raise ValueError(f"{path} is damaged ({error!r}): build the dataset again with --stage data") from error
-    # A manifest is data: it may name files of its own folder only.
-    for name in manifest["files"]:
-        if Path(name).name != name or not name.endswith(".safetensors"):
-            raise ValueError(f"{path} names {name!r}, which is not a file of this dataset")
-    return manifest
+        count = {name: len(found["clips"][name]) for name in SPLITS}
+        _ = int(found["spec"]["size"]), int(found["spec"]["standing_views"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{folder / manifest.NAME} is damaged ({error!r}): {_AGAIN}") from error
+    needed = [_clip(Path(), name, k).as_posix() for name in SPLITS for k in range(count[name])]
+    absent = sorted(set(needed) - set(found["files"]))
+    if absent:
+        raise ValueError(f"{folder / manifest.NAME} is damaged (it does not list {absent[0]}): {_AGAIN}")
+    return found
 
 
-def _digest(path: Path) -> str:
-    with path.open("rb") as f:
-        return hashlib.file_digest(f, "sha256").hexdigest()
+def _clip(folder: Path, split: str, k: int) -> Path:
+    return folder / "clips" / f"{split}-{k:03d}.safetensors"
+
+
+def _table(folder: Path, name: str) -> Path:
+    return folder / "images" / f"{name}.safetensors"
+
+
+def _image(folder: Path, name: str, pose: int, view: int) -> Path:
+    return folder / "images" / name / f"{pose:05d}_{view:02d}.png"
+
+
+def _pictures(folder: Path, name: str, views: np.ndarray) -> np.ndarray:
+    """All pictures (p, k, h, w, 4) of a set."""
+    paths = [_image(folder, name, pose, view) for pose, row in enumerate(views) for view in row]
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        pixels = np.stack(list(pool.map(exr.read_png, paths)))
+    return pixels.reshape(*views.shape, *pixels.shape[1:])
+
+
+@functools.cache
+def _atlas_fields() -> tuple[dataclasses.Field, ...]:
+    return tuple(f for f in dataclasses.fields(posmap.Atlas) if f.name != "size")
+
+
+def _atlas(arrays: dict[str, np.ndarray], size: int) -> posmap.Atlas:
+    return posmap.Atlas(**{f.name: jnp.asarray(arrays[f"atlas/{f.name}"]) for f in _atlas_fields()}, size=size)

@@ -242,3 +242,11 @@ def simulate(
         if progress:
             progress(end - start)
     return frames
+
+
+def settle(
+    avatar: AvatarMesh, transforms: Float[Array | np.ndarray, "j 3 4"], config: xpbd.XPBDConfig = xpbd.XPBDConfig()
+) -> Float[np.ndarray, "v 3"]:
+    """World vertices (v, 3) of an avatar that has stood still in one pose, transforms (j, 3, 4), for a while."""
+    still = jnp.broadcast_to(jnp.asarray(transforms), (2 * _CHUNK + 1, *np.shape(transforms)))
+    return simulate(avatar, still, config)[-1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import typing
+from collections.abc import Callable, Sequence
 
 import flax.struct
 import jax
@@ -11,12 +12,40 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from avatarjax import posmap
-from avatarjax.data import avatars
-from avatarjax.data.avatars import AvatarMesh
+from avatarjax.data import dressing
 from avatarjax.data.motion import clips, locomotion
 from avatarjax.data.motion.locomotion import Motion
+from avatarjax.data.wardrobe.assembly import AvatarMesh
+from avatarjax.physics import xpbd
 
 ACTIONS = ("idle", "forward", "backward", "left", "right")
+# Frames under the first key before a sequence begins: simulated, so that the cloth has found its way, but not recorded.
+LEAD_IN = 30
+# Frames of the transition from one action (row) to another (column), in the order of ACTIONS (UNICA Table A).
+TABLE_A = (
+    (0, 367, 362, 359, 362),
+    (264, 0, 330, 304, 308),
+    (264, 334, 0, 306, 304),
+    (234, 312, 307, 0, 329),
+    (260, 310, 309, 328, 0),
+)
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class Take:
+    """f frames of one sequence as NumPy arrays.
+
+    texels (f, t, 3) metres relative to the root of their own frame; roots (f, 3) the waist in the world; actions (f,)
+    where actions[k] drives frame k to k + 1; quats (f, j, 4) local rotations of the bones from the rest pose and hips
+    (f, 3) metres, with j = 0 where the skeleton is not known.
+    """
+
+    texels: Float[np.ndarray, "f t 3"]
+    roots: Float[np.ndarray, "f 3"]
+    actions: Int[np.ndarray, " f"]
+    quats: Float[np.ndarray, "f j 4"]
+    hips: Float[np.ndarray, "f 3"]
 
 
 @typing.no_type_check
@@ -34,73 +63,87 @@ class Recording:
     sequence: Int[Array, "f"]
 
 
-def transition_scripts(frames: int, seed: int, actions: int = len(ACTIONS)) -> Int[np.ndarray, "n f"]:
+def transition_scripts(frames: int | None, seed: int, actions: int = len(ACTIONS)) -> list[Int[np.ndarray, " f"]]:
     """All ordered pairs of different actions, a sequence each (UNICA A): the source for about a third, then the target.
 
-    The turning point varies by up to a twelfth of the sequence's length, so that it meets the gait in many phases.
-    Raises ValueError where a sequence is too short to hold a turn.
+    Every sequence has `frames` frames or, for None, those of UNICA Table A (five actions). The turning point varies by
+    up to a twelfth of the sequence's length, so that it meets the gait in many phases. Raises ValueError where a
+    sequence is too short to hold a turn, or where the table has no such action.
     """
-    if frames < 60:
+    if frames is None and actions != len(ACTIONS):
+        raise ValueError(f"UNICA's Table A has {len(ACTIONS)} actions, not {actions}: give a number of frames")
+    if frames is not None and frames < 60:
         raise ValueError(f"a transition needs at least 60 frames to settle before and after the turn, got {frames}")
     rng = np.random.default_rng(seed)
     scripts = []
     for source in range(actions):
         for target in range(actions):
             if source != target:
-                turn = frames // 3 + int(rng.integers(0, max(1, frames // 12)))
-                scripts.append([source] * turn + [target] * (frames - turn))
-    return np.asarray(scripts, np.int32)
+                length = frames or TABLE_A[source][target]
+                turn = length // 3 + int(rng.integers(0, max(1, length // 12)))
+                scripts.append(np.array([source] * turn + [target] * (length - turn), np.int32))
+    return scripts
 
 
 def simulate(
     avatar: AvatarMesh,
-    plans: dict[str, Int[np.ndarray, "_n _f"]],
-    headings: dict[str, Float[np.ndarray, "_n"]],
+    scripts: Sequence[Int[np.ndarray, "_f"]],
+    headings: Float[np.ndarray, " n"],
     seed: int,
-) -> dict[str, Motion]:
-    """The controller's motion under each plan's scripts (n, f), with leading axes n, f.
+    lead: int | None = None,
+) -> list[Motion]:
+    """The controller's motion under each script of keys, after LEAD_IN frames under its first key, or under `lead`.
 
-    `headings` (n,) yaw in radians is where a script looks that starts idle; gait phases are drawn by `seed`. All plans
-    run in one batch, padded to one length, so that the controller is compiled once.
+    `headings` (n,) yaw in radians is where a script looks that starts idle; gait phases are drawn by `seed`. All
+    scripts run in one batch, padded to one length, so that the controller is compiled once.
     """
-    longest = max(scripts.shape[1] for scripts in plans.values())
-    batch = np.concatenate([np.pad(s, ((0, 0), (0, longest - s.shape[1])), mode="edge") for s in plans.values()])
+    longest = max(len(script) for script in scripts)
+    batch = np.stack([np.pad(s, (LEAD_IN, longest - len(s)), mode="edge") for s in scripts])
+    if lead is not None:
+        batch[:, :LEAD_IN] = lead
     looping = clips.load_clips(avatar.rig)
     keys = jax.random.split(jax.random.key(seed), len(batch))
-    facing = np.concatenate([headings[name] for name in plans])
     run = jax.jit(jax.vmap(lambda a, k, h: locomotion.simulate(avatar.rig, looping, a, k, heading=h)))
-    everything = run(jnp.asarray(batch), keys, jnp.asarray(facing, jnp.float32))
-
-    motions, start = {}, 0
-    for name, (n, f) in ((name, scripts.shape) for name, scripts in plans.items()):
-        motions[name] = jax.tree.map(lambda x, a=start, n=n, f=f: x[a : a + n, :f], everything)
-        start += n
-    return motions
+    motions = jax.device_get(run(jnp.asarray(batch), keys, jnp.asarray(headings, jnp.float32)))
+    return [jax.tree.map(lambda x, k=k, s=s: x[k, : LEAD_IN + len(s)], motions) for k, s in enumerate(scripts)]
 
 
-def record(avatar: AvatarMesh, atlas: posmap.Atlas, scripts: Int[np.ndarray, "n f"], motion: Motion) -> Recording:
-    """Position-map texels of every frame of a batch of motions."""
-    encode = jax.jit(jax.vmap(lambda v: posmap.encode(atlas, v)))
-    texels, roots = [], []
-    for k in range(len(scripts)):
-        world = encode(jnp.asarray(vertices_of(avatar, motion, k)))
-        root = jnp.einsum("t,ftc->fc", atlas.waist, world)
-        texels.append(np.asarray(world - root[:, None]))
-        roots.append(np.asarray(root))
-    n, f = scripts.shape
-    return Recording(
-        texels=np.concatenate(texels),
-        roots=np.concatenate(roots),
-        actions=scripts.reshape(-1),
-        sequence=np.repeat(np.arange(n, dtype=np.int32), f),
+def take(
+    avatar: AvatarMesh,
+    atlas: posmap.Atlas,
+    motion: Motion,
+    actions: Int[np.ndarray, " f"],
+    config: xpbd.XPBDConfig = xpbd.XPBDConfig(),
+    progress: Callable[[int], typing.Any] | None = None,
+) -> tuple[Take, Float[np.ndarray, "f v 3"]]:
+    """What one motion with LEAD_IN frames before it gives, clothes and hair simulated, and the vertices (f, v, 3)
+    relative to the root of their frame, metres."""
+    vertices = dressing.simulate(avatar, motion.transforms, config, progress=progress)[LEAD_IN:]
+    texels = np.asarray(_encode(atlas, vertices))
+    roots = np.einsum("t,ftc->fc", np.asarray(atlas.waist), texels).astype(np.float32)
+    result = Take(
+        texels=texels - roots[:, None],
+        roots=roots,
+        actions=np.asarray(actions, np.int32),
+        quats=np.asarray(motion.local_quats[LEAD_IN:], np.float32),
+        hips=np.asarray(motion.hips[LEAD_IN:], np.float32),
     )
+    return result, vertices - roots[:, None]
 
 
-def vertices_of(
-    avatar: AvatarMesh, motion: Motion, sequence: int, frames: typing.Any = slice(None)
-) -> Float[np.ndarray, "f v 3"]:
-    """World vertices of chosen frames of one sequence of a batch of motions."""
-    return avatars.pose_vertices(avatar, motion.transforms[sequence][frames], motion.lagged[sequence][frames])
+@jax.jit
+def _encode(atlas: posmap.Atlas, vertices: Array) -> Array:
+    return jax.vmap(posmap.encode, in_axes=(None, 0))(atlas, vertices)
+
+
+def join(takes: Sequence[Take]) -> Recording:
+    """Takes one after the other."""
+    return Recording(
+        texels=np.concatenate([t.texels for t in takes]),
+        roots=np.concatenate([t.roots for t in takes]),
+        actions=np.concatenate([t.actions for t in takes]),
+        sequence=np.repeat(np.arange(len(takes), dtype=np.int32), [len(t.actions) for t in takes]),
+    )
 
 
 def group_ends(sequence: Int[np.ndarray, "f"], length: int = 4) -> Int[np.ndarray, "g"]:

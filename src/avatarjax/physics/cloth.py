@@ -17,11 +17,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
 
 # An edge closer than this (tangent of the angle, in the uv plane) to an axis runs along a thread.
 _ALONG_THREAD = 0.41
 # How much longer than the way along the cloth a tether is: it only catches what the edges let through.
 _TETHER_SLACK = 1.02
+# Metres: a vertex is worn over another that lies below it no further aside than this.
+_COVERED = 0.04
 # Metres: no vertex is kept further from the body than this, and none nearer.
 _CLEARANCE = (0.001, 0.006)
 
@@ -49,7 +52,9 @@ class Cloth:
     (c, m, 2) vertices of the distance constraints of each colour, n where there is none; lengths and compliances
     (c, m); tether (n,) the sewn vertex that a vertex hangs from and tether_length (n,) how far it may be from it;
     reach (n,) metres from where the skeleton would carry it; clearance (n,) metres kept from solid surfaces; drag (n,)
-    1 / metres: half the air's density times area and coefficient over mass; friction (n,).
+    1 / metres: half the air's density times area and coefficient over mass; friction (n,); pieces: how many vertices
+    each piece has, those that are worn over others after them; over (n,) 1 where a vertex lies outside the nearest
+    piece before its own.
     """
 
     inverse_masses: Float[Array, " n"]
@@ -64,6 +69,8 @@ class Cloth:
     clearance: Float[Array, " n"]
     drag: Float[Array, " n"]
     friction: Float[Array, " n"]
+    over: Float[Array, " n"]
+    pieces: tuple[int, ...] = flax.struct.field(pytree_node=False)
 
     @property
     def count(self) -> int:
@@ -83,9 +90,11 @@ def sew(
 ) -> Cloth:
     """The constants of a mesh (n, 3), (f, 3) whose triangles have uvs along the threads and one of `fabrics` each.
 
-    Vertices with `reach` 0 are sewn on. `distance` (n,) is how far each lies from solid surfaces in this pose, metres:
-    a layer that rests closer than usual is allowed to stay so. Raises ValueError where a free part of the cloth hangs
-    from nothing, or where a triangle has no area.
+    The triangles of one fabric number are a piece; their vertices follow each other, and a piece is worn over those of
+    lower numbers wherever it lies over them in this pose. Vertices with `reach` 0 are sewn on. `distance` (n,) is how
+    far each lies from solid surfaces in this pose, metres: a layer that rests closer than usual is allowed to stay so.
+    Raises ValueError where a free part of the cloth hangs from nothing, where a triangle has no area, or where the
+    vertices of pieces are mixed.
     """
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError(f"faces name vertices {faces.min()} to {faces.max()}, there are {len(vertices)}")
@@ -105,6 +114,11 @@ def sew(
     free = reach > 0
     inverse = np.where(free, 1 / np.maximum(mass, 1e-6), 0.0)
 
+    owner = np.zeros(len(vertices), np.int64)
+    owner[faces] = fabric_of[:, None]
+    if (np.diff(owner) < 0).any() or (owner[faces] != fabric_of[:, None]).any():
+        raise ValueError("the vertices of a piece of cloth must follow each other, in the order of the pieces")
+    pieces = tuple(int(n) for n in np.unique(owner, return_counts=True)[1])
     pairs, compliances = _constraints(vertices, faces, uvs, fabric_of, table, braces)
     moving = free[pairs].any(axis=1)
     pairs, compliances = pairs[moving], compliances[moving]
@@ -124,8 +138,10 @@ def sew(
         "clearance": np.clip(distance, *_CLEARANCE),
         "drag": 0.5 * 1.2 * drag * area / np.maximum(mass, 1e-6),
         "friction": friction,
+        "over": _worn_over(vertices, faces, pieces),
     }
     return Cloth(
+        pieces=pieces,
         faces=faces.astype(np.int32),
         pairs=padded_pairs.astype(np.int32),
         tether=tether.astype(np.int32),
@@ -186,6 +202,24 @@ def _tethers(vertices, faces, free) -> tuple[np.ndarray, np.ndarray]:
     if not np.isfinite(way).all():
         raise ValueError(f"{(~np.isfinite(way)).sum()} vertices of the cloth hang from nothing: sew each part on")
     return np.where(free, source, own), way * _TETHER_SLACK
+
+
+def _worn_over(vertices: np.ndarray, faces: np.ndarray, pieces: tuple[int, ...]) -> np.ndarray:
+    """1 for vertices that lie clearly outside the nearest vertex of an earlier piece in the pattern, 0 for others."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    flat = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    normals = np.stack([np.bincount(faces.ravel(), flat[:, k], len(vertices)) for k in range(3)], axis=1)
+    over = np.zeros(len(vertices))
+    start = pieces[0]
+    for count in pieces[1:]:
+        own = np.arange(start, start + count)
+        _, near = cKDTree(vertices[:start]).query(vertices[own])
+        unit = normals[near] / np.linalg.norm(normals[near], axis=1, keepdims=True)
+        offset = vertices[own] - vertices[near]
+        height = (offset * unit).sum(1)
+        over[own] = (height > 0) & ((offset**2).sum(1) - height**2 < _COVERED**2)
+        start += count
+    return over
 
 
 def _colour(pairs: np.ndarray, count: int) -> list[list[int]]:

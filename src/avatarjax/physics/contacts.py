@@ -18,6 +18,8 @@ from jaxtyping import Array, Float, Int
 _BLOCK = 16
 # Metres: a plane holds only so far around its point, and a vertex deeper than this is on the other side of a limb.
 _PLANE_RADIUS, _DEEPEST = 0.05, 0.10
+# The same for a sheet under a sheet, which is thin: deeper, a vertex is on its other side, and aside, beyond its edge.
+_LAYER_RADIUS = 0.03
 
 
 @typing.no_type_check
@@ -138,39 +140,62 @@ def _dot(a: Array, b: Array) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def find_neighbours(
-    positions: Float[Array, "n 3"], rest: Float[Array, "n 3"], apart: float, count: int
-) -> Int[Array, "k n"]:
-    """For each vertex `count` others that are near now and were more than `apart` metres away in the pattern.
+def find_inner(positions: Float[Array, "n 3"], pieces: tuple[int, ...]) -> Int[Array, " n"]:
+    """For each vertex (n, 3) the nearest one of the pieces before its own, which it is worn over; itself where there
+    is none. `pieces` says how many vertices each has, in the order in which they are worn."""
+    found, start = [], 0
+    for count in pieces:
+        own = slice(start, start + count)
+        found.append(nearest(positions[own], positions[:start]) if start else jnp.arange(count, dtype=jnp.int32))
+        start += count
+    return jnp.concatenate(found)
 
-    The vertices are dealt out to `count` hands, and each hand gives its nearest.
-    """
-    found = []
-    for hand in range(count):
-        mine = nearest(positions, positions[hand::count], rest, rest[hand::count], apart)
-        found.append(mine * count + hand)
-    return jnp.minimum(jnp.stack(found), positions.shape[0] - 1)
+
+def keep_outside(
+    positions: Float[Array, "n 3"],
+    inner: Int[Array, " n"],
+    normals: Float[Array, "n 3"],
+    over: Float[Array, " n"],
+    gap: float,
+) -> Float[Array, "n 3"]:
+    """Positions (n, 3) moved to `gap` metres outside the planes of the vertices `inner` (n,) that they are worn over,
+    whose unit normals are rows of `normals`; `over` (n,) is 0 where that does not hold."""
+    point, normal = positions[inner].T, normals[inner].T
+    offset = positions.T - point
+    height = _dot(offset, normal)
+    aside = _dot(offset, offset) - height * height
+    held = (aside < _LAYER_RADIUS**2) & (height > -_LAYER_RADIUS)
+    depth = jnp.where(held, jnp.maximum(gap - height, 0), 0.0) * over
+    return positions + (depth[None] * normal).T
+
+
+def find_neighbours(
+    positions: Float[Array, "n 3"], rest: Float[Array, "n 3"], pieces: tuple[int, ...], apart: float
+) -> Int[Array, " n"]:
+    """For each vertex the nearest of its own piece that was more than `apart` metres away in the pattern."""
+    found, start = [], 0
+    for count in pieces:
+        own = slice(start, start + count)
+        found.append(start + nearest(positions[own], positions[own], rest[own], rest[own], apart))
+        start += count
+    return jnp.concatenate(found)
 
 
 def separate(
     positions: Float[Array, "n 3"],
-    neighbours: Int[Array, "k n"],
+    neighbours: Int[Array, " n"],
     rest: Float[Array, "n 3"],
     free: Float[Array, " n"],
     distance: float,
 ) -> Float[Array, "n 3"]:
-    """Positions (n, 3) moved away from `neighbours` that are nearer than `distance` metres, but not in the pattern.
+    """Positions (n, 3) moved away from `neighbours` (n,) that are nearer than `distance` metres, but not in the
+    pattern.
 
     Each of the two goes half the way (each computes its own half), all of it where the other is sewn on (`free` 0).
     """
-    total = jnp.zeros_like(positions)
-    touching = jnp.zeros(positions.shape[0])
-    for other in neighbours:
-        offset = positions - positions[other]
-        length = jnp.sqrt(jnp.sum(offset * offset, axis=1) + 1e-18)
-        between = jnp.sum((rest - rest[other]) ** 2, axis=1)
-        lacking = jnp.where(between > distance**2, jnp.maximum(distance - length, 0), 0.0)
-        share = lacking * free / jnp.maximum(free + free[other], 1e-9)
-        total = total + (share / length)[:, None] * offset
-        touching = touching + (lacking > 0)
-    return positions + total / jnp.maximum(touching, 1)[:, None]
+    offset = positions - positions[neighbours]
+    length = jnp.sqrt(jnp.sum(offset * offset, axis=1) + 1e-18)
+    between = jnp.sum((rest - rest[neighbours]) ** 2, axis=1)
+    lacking = jnp.where(between > distance**2, jnp.maximum(distance - length, 0), 0.0)
+    share = lacking * free / jnp.maximum(free + free[neighbours], 1e-9)
+    return positions + (share / length)[:, None] * offset

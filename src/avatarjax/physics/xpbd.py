@@ -25,9 +25,9 @@ class XPBDConfig:
     """How a frame is simulated: `substeps` steps; solid surfaces are found anew `refreshes` times (a divisor of
     substeps), the cloth's own neighbours once.
 
-    gravity, wind in metres a second (squared); damping: share of the speed lost a second; distance: metres that parts
-    of the cloth keep from each other, 0 for no self-collision, with `neighbours` candidates a vertex; top_speed: metres
-    a second that nothing exceeds against the body.
+    gravity, wind in metres a second (squared); damping: share of the speed lost a second; distance: metres that a sheet
+    keeps from itself and from those it is worn over, 0 for no self-collision; top_speed: metres a second that nothing
+    exceeds against the body.
     """
 
     fps: float = 30.0
@@ -36,8 +36,7 @@ class XPBDConfig:
     gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
     damping: float = 0.5
-    distance: float = 0.012
-    neighbours: int = 3
+    distance: float = 0.01
     top_speed: float = 12.0
 
     def __post_init__(self):
@@ -70,7 +69,7 @@ def step(cloth: Cloth, state: ClothState, start: Drive, end: Drive, config: XPBD
     part = config.substeps // config.refreshes
     neighbours = None
     if config.distance > 0:
-        neighbours = contacts.find_neighbours(state.positions, cloth.rest, config.distance, config.neighbours)
+        neighbours = contacts.find_neighbours(state.positions, cloth.rest, cloth.pieces, config.distance)
 
     def refresh(state: ClothState, k: Array) -> tuple[ClothState, None]:
         low = jax.tree.map(lambda a, b: a + (b - a) * (k / config.refreshes), start, end)
@@ -125,6 +124,7 @@ def _part(
     loose = free[:, None] > 0
     carried = (end.targets - start.targets) / (steps * dt)
     slower = (1 - config.damping) ** dt
+    inner = contacts.find_inner(state.positions, cloth.pieces) if config.distance > 0 else None
 
     def one(state: ClothState, k: Array) -> tuple[ClothState, None]:
         share = (k + 1) / steps
@@ -142,6 +142,7 @@ def _part(
         x = _tie(x, x[cloth.tether], cloth.tether_length)
         if neighbours is not None:
             x = contacts.separate(x, neighbours, cloth.rest, free, config.distance)
+            x = contacts.keep_outside(x, inner, normals, cloth.over, config.distance)
         x = _tie(x, target, cloth.reach)
         columns = contacts.push_out_of_capsules(x.T, jax.tree.map(between, start.capsules, end.capsules))
         points, lean = between(low.points, high.points), between(low.normals, high.normals)

@@ -1,6 +1,7 @@
 """Position maps: the six-view atlas, encoding and decoding, upscaling, principal components, public files."""
 
 from avatarjax.posmap.atlas import Atlas, Window, build_atlas, windows
+from avatarjax.posmap.box import Box, bounding_box, into_box
 from avatarjax.posmap.codec import (
     denormalize,
     encode,
@@ -15,14 +16,17 @@ from avatarjax.posmap.upscale import Upscaler, build_upscaler, upscale
 
 __all__ = [
     "Atlas",
+    "Box",
     "Upscaler",
     "Window",
+    "bounding_box",
     "build_atlas",
     "build_upscaler",
     "denormalize",
     "encode",
     "from_map",
     "heading",
+    "into_box",
     "normalize",
     "normalize_group",
     "root",

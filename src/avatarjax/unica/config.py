@@ -36,12 +36,14 @@ class StageConfig:
 class DataConfig:
     """What is simulated and rendered. The paper has 6,253 frames an avatar and renders every one in 50 views."""
 
-    transition_frames: int = 312
-    held_out_frames: int = 150
+    transition_frames: int | None = None  # of each of the 20 transitions; None: those of UNICA Table A
+    held_out_frames: int | None = 150
     image_poses: int = 6253
     image_views: int = 50
     standing_views: int = 50
     image_size: int = 1024
+    cloth_steps: int = 20  # ours
+    vertices: typing.Literal["none", "float16", "float32"] = "none"  # ours
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,6 +148,7 @@ def _ci() -> UnicaConfig:
             image_views=6,
             standing_views=50,
             image_size=64,
+            cloth_steps=10,
         ),
         latent=LatentConfig(
             vae=VAEConfig(channels=(16, 32, 32), residual_blocks=1, positions=32),

@@ -121,8 +121,8 @@ def dress(avatar: Avatar, frame: Frame) -> Gaussians:
     # The map is normalised about the root of the frame before; its own root tells where that is in the world.
     origin = frame.root - (posmap.root(avatar.atlas, texels) - 0.5) / avatar.atlas.scale
     points = posmap.upscale(avatar.upscaler, pcs.align(avatar.pca, texels))
-    box = align.bounding_box(points)
-    coarse = appearance.coarse_gaussians(avatar.base, align.into_box(box, points), box.side / avatar.atlas.scale)
+    box = posmap.bounding_box(points)
+    coarse = appearance.coarse_gaussians(avatar.base, posmap.into_box(box, points), box.side / avatar.atlas.scale)
     refined = appearance.refine(avatar.config.appearance, avatar.appearance, coarse)
     return align.place(refined, posmap.denormalize(avatar.atlas, points, origin))
 

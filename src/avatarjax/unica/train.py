@@ -29,7 +29,7 @@ from avatarjax.splat import SplatConfig, render, required_capacity
 from avatarjax.splat.losses import l1, ssim
 from avatarjax.train import TrainState, fit, make_step, new_state, weights
 from avatarjax.train.state import Loss, optimiser
-from avatarjax.unica import align, appearance, batches, coefficients, latent
+from avatarjax.unica import appearance, batches, coefficients, latent
 from avatarjax.unica import fit as closed_form
 from avatarjax.unica.coefficients import CoefficientDenoiser, CoefficientDynamics, Context
 from avatarjax.unica.config import StageConfig, UnicaConfig
@@ -262,8 +262,8 @@ def fit_alignment(config: UnicaConfig, data: Dataset, run: Run) -> pcs.PCA:
 def boxed_points(upscaler: posmap.Upscaler, texels: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Upscaled points (n, 3) of a pose in its box, and the box' side in the texels' unit (UNICA B.1)."""
     points = posmap.upscale(upscaler, texels)
-    box = align.bounding_box(points)
-    return align.into_box(box, points), box.side
+    box = posmap.bounding_box(points)
+    return posmap.into_box(box, points), box.side
 
 
 def photometric_loss(
