@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import typing
+from collections.abc import Sequence
 
 import flax.struct
 import jax
@@ -12,6 +13,8 @@ from jaxtyping import Array, Float
 
 from avatarjax import rotations
 from avatarjax.data import body, skinning
+from avatarjax.data.motion import footsteps
+from avatarjax.data.motion.footsteps import Feet
 from avatarjax.io import weights
 
 # Quaternion components are stored as int16 multiples of 1 / QUAT_UNIT.
@@ -19,6 +22,8 @@ QUAT_UNIT = 32767.0
 # The emotes' hips rest one metre above the ground.
 _SOURCE_HIPS = 1.0
 _FPS = 30.0
+# A start takes up the run this many frames after the landing of the foot that carries.
+_START_FRAMES = 1.5
 
 
 @typing.no_type_check
@@ -34,11 +39,23 @@ class Clip:
 @typing.no_type_check
 @flax.struct.dataclass
 class Clips:
-    """The clips that locomotion blends, and run_speed: metres a second at which the running feet do not slide."""
+    """The clips that locomotion blends, and run_speed: metres a second at which the running feet do not slide.
+
+    start_phases (2,) are the phases of the run, in cycles, from which a standing figure sets off: one foot carries, the
+    other swings. idle_feet and run_feet say where the feet of the two clips are and when they bear weight. emotes has one clip for
+    each extra action, all padded to one length n: quats (e, n, j, 4), hips (e, n, 3), emote_feet with a leading axis e,
+    emote_frames (e,) their own lengths; None where there are no extra actions.
+    """
 
     idle: Clip
     run: Clip
     run_speed: Float[Array, ""]
+    start_phases: Float[Array, " 2"]
+    idle_feet: Feet
+    run_feet: Feet
+    emotes: Clip | None = None
+    emote_feet: Feet | None = None
+    emote_frames: Float[Array, " e"] | None = None
 
 
 def clip_names() -> tuple[str, ...]:
@@ -62,17 +79,49 @@ def load_clip(name: str, rig: body.Rig) -> Clip:
     return Clip(jnp.asarray(quats), jnp.asarray(hips * scale))
 
 
-def load_clips(rig: body.Rig) -> Clips:
-    """Idle and run for a rig, both set on the ground, with the run's own speed measured from its stance feet."""
+def load_clips(rig: body.Rig, emotes: Sequence[str] = ()) -> Clips:
+    """Idle and run for a rig, both set on the ground, with the run's own speed measured from its stance feet.
+
+    `emotes` names clips of the asset that become extra actions, in this order.
+    """
     idle, run = load_clip("idle", rig), load_clip("run", rig)
-    idle_low = _sole_heights(rig, idle)[0].min(axis=(1, 2))
+    idle_low = sole_heights(rig, idle)[0].min(axis=(1, 2))
     idle = idle.replace(hips=idle.hips.at[:, 1].add(-idle_low))
-    heights, points = _sole_heights(rig, run)
+    heights, points = sole_heights(rig, run)
     run = run.replace(hips=run.hips.at[:, 1].add(-np.percentile(heights.min(axis=(1, 2)), 10)))
     # A point of the sole near the ground travels backwards at the speed of the run.
     backwards = -np.diff(points[..., 2], axis=0, append=points[:1, ..., 2]) * _FPS
     stance = heights < np.percentile(heights, 12)
-    return Clips(idle, run, jnp.float32(np.median(backwards[stance])))
+    speed = float(np.median(backwards[stance]))
+    idle_feet, run_feet = feet_of(rig, idle), feet_of(rig, run, speed)
+    stands = np.asarray(run_feet.contacts)
+    lands = (stands & ~np.roll(stands, 1, axis=0)).argmax(axis=0)
+    starts = jnp.asarray((lands + _START_FRAMES) / len(stands) % 1.0, jnp.float32)
+    looping = Clips(idle, run, jnp.float32(speed), starts, idle_feet, run_feet)
+    if not emotes:
+        return looping
+    played = [ground_clip(rig, load_clip(name, rig)) for name in emotes]
+    longest = max(len(clip.hips) for clip in played)
+    feet = [feet_of(rig, clip, looping=False) for clip in played]
+
+    def pad(x: Array) -> Array:
+        return jnp.concatenate([x, jnp.repeat(x[-1:], longest - len(x), axis=0)])
+
+    stack = jax.tree.map(lambda *xs: jnp.stack([pad(x) for x in xs]), *played)
+    stacked_feet = jax.tree.map(lambda *xs: jnp.stack([pad(x) for x in xs]), *feet)
+    frames = jnp.array([len(clip.hips) for clip in played], jnp.float32)
+    return looping.replace(emotes=stack, emote_feet=stacked_feet, emote_frames=frames)
+
+
+def ground_clip(rig: body.Rig, clip: Clip) -> Clip:
+    """The clip raised or lowered as a whole so that its soles, where they are lowest, are on the ground."""
+    lowest = sole_heights(rig, clip)[0].min(axis=(1, 2))
+    return clip.replace(hips=clip.hips.at[:, 1].add(-np.percentile(lowest, 10)))
+
+
+def feet_of(rig: body.Rig, clip: Clip, speed: float = 0.0, looping: bool = True) -> Feet:
+    """Where the feet of a clip are, and when they bear weight if the figure moves at `speed` metres a second."""
+    return footsteps.clip_feet(rig, _transforms(rig, clip), clip.quats, speed, looping)
 
 
 def sample(clip: Clip, phase: Float[Array, ""]) -> tuple[Float[Array, "j 4"], Float[Array, " 3"]]:
@@ -86,7 +135,11 @@ def sample(clip: Clip, phase: Float[Array, ""]) -> tuple[Float[Array, "j 4"], Fl
     return quats, clip.hips[first] * (1 - weight) + clip.hips[second] * weight
 
 
-def _sole_heights(rig: body.Rig, clip: Clip) -> tuple[np.ndarray, np.ndarray]:
-    transforms = jax.jit(jax.vmap(lambda q, h: skinning.forward_kinematics(rig, q, h)))(clip.quats, clip.hips)
-    points = np.asarray(jax.vmap(lambda t: skinning.sole_points(rig, t))(transforms))
+def sole_heights(rig: body.Rig, clip: Clip) -> tuple[Float[np.ndarray, "f 2 s"], Float[np.ndarray, "f 2 s 3"]]:
+    """Heights and places of the sole points of a clip, metres."""
+    points = np.asarray(jax.vmap(lambda t: skinning.sole_points(rig, t))(_transforms(rig, clip)))
     return points[..., 1], points
+
+
+def _transforms(rig: body.Rig, clip: Clip) -> Array:
+    return jax.jit(jax.vmap(lambda q, h: skinning.forward_kinematics(rig, q, h)))(clip.quats, clip.hips)

@@ -3,7 +3,8 @@
 The key sets the wanted direction of movement in the world. Springs act on the angle of the heading and on the scalar
 speed, never on the velocity vector: the figure turns about, it does not slide through a standstill. Idle and run follow
 each other by inertialisation (Bollo 2018, "Inertialization: high-performance animation transitions in Gears of War"):
-at a switch the difference of pose and its velocity are kept and decay to nothing on top of the new clip.
+at a switch the difference of pose and its velocity are kept and decay to nothing on top of the new clip. The feet
+are planned apart from the pose (stride warping: steps are as long as the speed makes them), and `footsteps` pins them.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from jaxtyping import Array, Float, Int
 from avatarjax import rotations
 from avatarjax.data import skinning
 from avatarjax.data.body import Rig
+from avatarjax.data.motion import footlock, footsteps
 from avatarjax.data.motion.clips import Clips, sample
 from avatarjax.physics import springs
 
@@ -31,7 +33,9 @@ class LocomotionConfig:
     """Constants of the runner. Angles in radians, frequencies in radians a second; action 0 is idle.
 
     `turn_frequency` is tuned to UNICA's turns: 12 frames for 180 degrees and 9 for 90 until the movement direction
-    stays within 12 degrees of the new one.
+    stays within 12 degrees of the new one. `foot_lock` pins the feet to the ground while they bear weight. `emotes`
+    names the clips of the extra actions 5, 6, ...: played in place, over and over while the key is held; `Clips` must
+    be loaded with the same names.
     """
 
     fps: float = 30.0
@@ -48,6 +52,17 @@ class LocomotionConfig:
     lean_frequency: float = 14.0
     look_per_turn: float = 0.05
     look_limit: float = 0.5
+    foot_lock: bool = True
+    foot_lookahead: float = 0.05
+    step_tolerance: float = 0.05
+    emote_tolerance: float = 0.14
+    emote_speed: float = 0.4
+    emotes: tuple[str, ...] = ()
+
+
+def action_names(config: LocomotionConfig = LocomotionConfig()) -> tuple[str, ...]:
+    """Names of the actions by id: UNICA's five, then the emotes of the configuration."""
+    return ("idle", "forward", "backward", "left", "right", *config.emotes)
 
 
 @typing.no_type_check
@@ -71,8 +86,8 @@ class Motion:
 @typing.no_type_check
 @flax.struct.dataclass
 class _State:
-    """What one frame hands to the next; `blend` is the decaying pose offset as rotation vectors (j + 1, 3), hips
-    last."""
+    """What one frame hands to the next; `mode` is 0 for idle, 1 for running, 2 and more for the emotes, `clock` the
+    frame of the emote, `blend` the decaying pose offset as rotation vectors (j + 1, 3), hips last."""
 
     heading: Array
     heading_rate: Array
@@ -80,7 +95,8 @@ class _State:
     speed_rate: Array
     position: Array
     phases: Array
-    running: Array
+    mode: Array
+    clock: Array
     lean: Array
     lean_rate: Array
     blend: Array
@@ -91,8 +107,8 @@ def initial_state(
     clips: Clips, action: Int[Array, ""], key: Array, config: LocomotionConfig, heading: typing.Any
 ) -> _State:
     """Steady motion under `action`: running at full speed in its direction, or standing with the given heading."""
-    running = action > 0
-    yaw = jnp.asarray(config.directions, jnp.float32)[jnp.maximum(action - 1, 0)]
+    running = (action > 0) & (action <= len(config.directions))
+    yaw = jnp.asarray(config.directions, jnp.float32)[jnp.clip(action - 1, 0, 3)]
     zero = jnp.zeros(())
     blend = jnp.zeros((clips.idle.quats.shape[1] + 1, 3))
     return _State(
@@ -102,7 +118,8 @@ def initial_state(
         speed_rate=zero,
         position=jnp.zeros(2),
         phases=jax.random.uniform(key, (2,)),
-        running=running,
+        mode=_mode(action, jnp.zeros(()), config),
+        clock=zero,
         lean=jnp.zeros(2),
         lean_rate=jnp.zeros(2),
         blend=blend,
@@ -110,9 +127,30 @@ def initial_state(
     )
 
 
-def _source(clips: Clips, running: Array, phases: Array) -> tuple[Array, Array]:
+def _mode(action: Array, speed: Array, config: LocomotionConfig) -> Array:
+    """What to play under an action: an emote waits, idling, until the figure has nearly stopped."""
+    running = (action > 0) & (action <= len(config.directions))
+    mode = jnp.where(running, 1, 0)
+    if not config.emotes:
+        return mode
+    emote = (action > len(config.directions)) & (speed < config.emote_speed)
+    return jnp.where(emote, action - len(config.directions) + 1, mode)
+
+
+def _source(clips: Clips, mode: Array, phases: Array, clock: Array) -> tuple[Array, Array]:
     standing, going = sample(clips.idle, phases[0]), sample(clips.run, phases[1])
-    return jax.tree.map(lambda a, b: jnp.where(running, b, a), standing, going)
+    pose = jax.tree.map(lambda a, b: jnp.where(mode == 1, b, a), standing, going)
+    if clips.emotes is None:
+        return pose
+    which, frame = _emote_frame(clips, mode, clock)
+    played = clips.emotes.quats[which, frame], clips.emotes.hips[which, frame]
+    return jax.tree.map(lambda a, b: jnp.where(mode > 1, b, a), pose, played)
+
+
+def _emote_frame(clips: Clips, mode: Array, clock: Array) -> tuple[Array, Array]:
+    which = jnp.clip(mode - 2, 0, len(clips.emote_frames) - 1)
+    frame = jnp.clip(jnp.round(clock), 0, clips.emote_frames[which] - 1)
+    return which, frame.astype(jnp.int32)
 
 
 def _difference(a: tuple[Array, Array], b: tuple[Array, Array]) -> Array:
@@ -132,11 +170,12 @@ def _step(
     """Advance one frame under `action`; the output is the frame before it (`actions[k]` drives frame k to k + 1)."""
     dt = 1 / config.fps
     spring = functools.partial(springs.critical_step, dt=dt)
-    pose = _offset(_source(clips, state.running, state.phases), state.blend)
-    output = _place(pose, state, config, look), state.position, state.heading, state.speed
+    pose = _offset(_source(clips, state.mode, state.phases, state.clock), state.blend)
+    output = _place(pose, state, config, look), state
 
-    running = action > 0
-    wanted = jnp.asarray(config.directions, jnp.float32)[jnp.maximum(action - 1, 0)]
+    mode = _mode(action, state.speed, config)
+    running = mode == 1
+    wanted = jnp.asarray(config.directions, jnp.float32)[jnp.clip(action - 1, 0, 3)]
     error = (wanted - state.heading + jnp.pi) % (2 * jnp.pi) - jnp.pi
     # Half a turn has two ways round: within three degrees of it, always take the one that increases the yaw.
     error = jnp.where(error < -jnp.pi + 0.05, error + 2 * jnp.pi, error)
@@ -149,18 +188,32 @@ def _step(
         state.speed, state.speed_rate, jnp.where(running, top, 0.0), frequency=config.speed_frequency
     )
     effort = jnp.minimum(speed / clips.run_speed, 1.0)
-    gait = config.slowest_gait + (1 - config.slowest_gait) * effort
+    gait = _gait(clips, speed, config)
     rates = jnp.stack([jnp.ones(()) / clips.idle.quats.shape[0], gait / clips.run.quats.shape[0]]) * config.fps
     bank = jnp.clip(-config.lean_per_turn * heading_rate * effort, -config.lean_limit, config.lean_limit)
     pitch = jnp.clip(config.pitch_per_acceleration * speed_rate, -config.pitch_limit, config.pitch_limit)
     lean, lean_rate = spring(state.lean, state.lean_rate, jnp.stack([pitch, bank]), frequency=config.lean_frequency)
 
+    # A standing figure sets off on the foot that the phase of the gait is nearer to.
+    nearness = jnp.cos(2 * jnp.pi * (clips.start_phases - state.phases[1]))
+    starting = running & (state.mode != 1) & (state.speed < config.emote_speed)
+    start = jnp.where(nearness[0] > nearness[1], clips.start_phases[0], clips.start_phases[1])
+    phases = state.phases.at[1].set(jnp.where(starting, start, state.phases[1]))
+    # An emote that is over starts again, which is a switch like any other.
+    switched = mode != state.mode
+    clock = state.clock
+    if clips.emotes is not None:
+        which, _ = _emote_frame(clips, mode, clock)
+        switched = switched | ((mode > 1) & (clock >= clips.emote_frames[which] - 1))
+        clock = jnp.where(switched, 0.0, clock)
+
     # At a switch: the offset of the old motion from the new clip, here and one frame ago, gives its value and velocity.
-    before = state.phases - rates * dt
-    old_before = _offset(_source(clips, state.running, before), state.blend - state.blend_rate * dt)
-    fresh = _difference(pose, _source(clips, running, state.phases))
-    fresh_before = _difference(old_before, _source(clips, running, before))
-    switched = running != state.running
+    step = rates * dt
+    old_before = _offset(
+        _source(clips, state.mode, state.phases - step, state.clock - 1), state.blend - state.blend_rate * dt
+    )
+    fresh = _difference(pose, _source(clips, mode, phases, clock))
+    fresh_before = _difference(old_before, _source(clips, mode, phases - step, clock - 1))
     blend = jnp.where(switched, fresh, state.blend)
     blend_rate = jnp.where(switched, (fresh - fresh_before) / dt, state.blend_rate)
     blend, blend_rate = spring(blend, blend_rate, 0.0, frequency=config.blend_frequency)
@@ -172,14 +225,20 @@ def _step(
         speed=speed,
         speed_rate=speed_rate,
         position=state.position + direction * speed * dt,
-        phases=state.phases + rates * dt,
-        running=running,
+        phases=phases + step,
+        mode=mode,
+        clock=clock + 1,
         lean=lean,
         lean_rate=lean_rate,
         blend=blend,
         blend_rate=blend_rate,
     )
     return state, output
+
+
+def _gait(clips: Clips, speed: Array, config: LocomotionConfig) -> Array:
+    """How fast the run's clip plays, 1 at full speed."""
+    return config.slowest_gait + (1 - config.slowest_gait) * jnp.minimum(speed / clips.run_speed, 1.0)
 
 
 def _place(pose: tuple[Array, Array], state: _State, config: LocomotionConfig, look: np.ndarray) -> tuple[Array, Array]:
@@ -219,14 +278,82 @@ def simulate(
     look[[rig.index(name) for name in ("Spine1", "Neck", "Head")]] = 1 / 3
     state = initial_state(clips, actions[0], key, config, heading)
     step = functools.partial(_step, clips, config, look)
-    _, ((quats, hips), positions, headings, speeds) = jax.lax.scan(step, state, actions)
+    _, ((quats, hips), states) = jax.lax.scan(step, state, actions)
+    if config.foot_lock:
+        plan = _plan(rig, clips, config, states)
+        quats, hips, transforms = footsteps.lock_feet(rig, quats, hips, plan)
+    else:
+        transforms = jax.vmap(skinning.forward_kinematics, in_axes=(None, 0, 0))(rig, quats, hips)
+        lift = _ground(rig, transforms, states.speed / clips.run_speed)
+        transforms = transforms.at[..., 1, 3].add(lift[:, None])
+        hips = hips.at[:, 1].add(lift)
+    roots = jnp.stack([states.position[:, 0], jnp.zeros(len(actions)), states.position[:, 1]], axis=1)
+    return Motion(quats, hips, transforms, roots, states.heading, states.speed)
 
-    transforms = jax.vmap(skinning.forward_kinematics, in_axes=(None, 0, 0))(rig, quats, hips)
-    lift = _ground(rig, transforms, speeds / clips.run_speed)
-    transforms = transforms.at[..., 1, 3].add(lift[:, None])
-    hips = hips.at[:, 1].add(lift)
-    roots = jnp.stack([positions[:, 0], jnp.zeros(len(actions)), positions[:, 1]], axis=1)
-    return Motion(quats, hips, transforms, roots, headings, speeds)
+
+def _plan(rig: Rig, clips: Clips, config: LocomotionConfig, states: _State) -> footsteps.Plan:
+    """Where the feet should be in every frame of `states` (leading axis f)."""
+    dt = 1 / config.fps
+    home = footsteps.standing(rig, jax.tree.map(lambda x: x[0], clips.idle_feet))
+
+    # Running: the clip's feet, the stride as long as the speed makes it, turned a little ahead of the body.
+    gait = _gait(clips, states.speed, config)
+    stride = jnp.minimum(states.speed / (gait * clips.run_speed), 1.2)
+    back = states.position - _forward(states.heading) * (states.speed * dt)[:, None]
+    ahead = states.heading + states.heading_rate * config.foot_lookahead
+    phases = states.phases[:, 1]
+    rate = gait / clips.run.quats.shape[0]
+    run, run_before = (
+        jax.vmap(functools.partial(_warp, home, clips.run_feet))(p, stride) for p in (phases, phases - rate)
+    )
+    now = footsteps.in_world(run, states.position, ahead)
+    before = footsteps.in_world(run_before, back, ahead - states.heading_rate * dt)
+
+    # Standing: where the figure will have come to rest, which the springs of speed and heading say.
+    rest, facing = _resting(config, states, dt)
+    homes = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(phases), *x.shape)), home)
+    stand = footsteps.in_world(homes, rest, facing)
+    stand_before = jax.tree.map(lambda x: jnp.concatenate([x[:1], x[:-1]]), stand)
+    running = states.mode == 1
+    tolerance = jnp.where(running, jnp.inf, config.step_tolerance)
+
+    choices = [(running, now, before), (~running, stand, stand_before)]
+    if clips.emotes is not None:
+        played, played_before = (
+            footsteps.in_world(jax.vmap(functools.partial(_emote_feet, clips))(states.mode, states.clock - k), rest, facing)
+            for k in (0, 1)
+        )
+        choices.append((states.mode > 1, played, played_before))
+        tolerance = jnp.where(states.mode > 1, config.emote_tolerance, tolerance)
+    return footsteps.plan(choices, tolerance)
+
+
+def _forward(heading: Array) -> Array:
+    return jnp.stack([jnp.sin(heading), jnp.cos(heading)], axis=-1)
+
+
+def _warp(home: footsteps.Feet, feet: footsteps.Feet, phase: Array, stride: Array) -> footsteps.Feet:
+    """The running feet at a phase with their strides, and the height they swing to, scaled to a slower figure."""
+    run = footsteps.sample_feet(feet, phase)
+    flat = home.balls[:, 1]
+    lifted = flat + (run.balls[:, 1] - flat) * (0.4 + 0.6 * jnp.minimum(stride, 1.0))
+    balls = jnp.stack([run.balls[:, 0], lifted, run.balls[:, 2] * stride], axis=-1)
+    return run.replace(balls=balls)
+
+
+def _resting(config: LocomotionConfig, states: _State, dt: float) -> tuple[Array, Array]:
+    """Place (f, 2) and yaw (f,) in which the figure would come to rest if no key were held from this frame on."""
+    w = config.turn_frequency * dt
+    decay = math.exp(-w)
+    facing = states.heading + states.heading_rate * dt * decay / (1 - (1 - w) * decay)
+    distance = 2 * states.speed / config.speed_frequency + states.speed_rate / config.speed_frequency**2
+    # Most of the way is covered early: its direction is nearer to the present heading than to the last.
+    return states.position + _forward(0.6 * states.heading + 0.4 * facing) * distance[:, None], facing
+
+
+def _emote_feet(clips: Clips, mode: Array, clock: Array) -> footsteps.Feet:
+    which, frame = _emote_frame(clips, mode, clock)
+    return jax.tree.map(lambda x: x[which, frame], clips.emote_feet)
 
 
 def _ground(rig: Rig, transforms: Array, effort: Array) -> Array:
