@@ -53,8 +53,8 @@ class Cloth:
     (c, m); tether (n,) the sewn vertex that a vertex hangs from and tether_length (n,) how far it may be from it;
     reach (n,) metres from where the skeleton would carry it; clearance (n,) metres kept from solid surfaces; drag (n,)
     1 / metres: half the air's density times area and coefficient over mass; friction (n,); pieces: how many vertices
-    each piece has, those that are worn over others after them; over (n,) 1 where a vertex lies outside the nearest
-    piece before its own.
+    each piece has, those that are worn over others after them; covering: for each piece the vertices (c,) that lie
+    over an earlier one.
     """
 
     inverse_masses: Float[Array, " n"]
@@ -69,7 +69,7 @@ class Cloth:
     clearance: Float[Array, " n"]
     drag: Float[Array, " n"]
     friction: Float[Array, " n"]
-    over: Float[Array, " n"]
+    covering: tuple[Int[Array, " c"], ...]
     pieces: tuple[int, ...] = flax.struct.field(pytree_node=False)
 
     @property
@@ -138,10 +138,10 @@ def sew(
         "clearance": np.clip(distance, *_CLEARANCE),
         "drag": 0.5 * 1.2 * drag * area / np.maximum(mass, 1e-6),
         "friction": friction,
-        "over": _worn_over(vertices, faces, pieces),
     }
     return Cloth(
         pieces=pieces,
+        covering=_covering(vertices, faces, pieces),
         faces=faces.astype(np.int32),
         pairs=padded_pairs.astype(np.int32),
         tether=tether.astype(np.int32),
@@ -204,22 +204,21 @@ def _tethers(vertices, faces, free) -> tuple[np.ndarray, np.ndarray]:
     return np.where(free, source, own), way * _TETHER_SLACK
 
 
-def _worn_over(vertices: np.ndarray, faces: np.ndarray, pieces: tuple[int, ...]) -> np.ndarray:
-    """1 for vertices that lie clearly outside the nearest vertex of an earlier piece in the pattern, 0 for others."""
+def _covering(vertices: np.ndarray, faces: np.ndarray, pieces: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    """For each piece the vertices that lie over the nearest vertex of an earlier piece in the pattern."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     flat = np.repeat(np.cross(b - a, c - a), 3, axis=0)
     normals = np.stack([np.bincount(faces.ravel(), flat[:, k], len(vertices)) for k in range(3)], axis=1)
-    over = np.zeros(len(vertices))
-    start = pieces[0]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    covering, start = [np.zeros(0, np.int32)], pieces[0]
     for count in pieces[1:]:
-        own = np.arange(start, start + count)
+        own = np.arange(start, start + count, dtype=np.int32)
         _, near = cKDTree(vertices[:start]).query(vertices[own])
-        unit = normals[near] / np.linalg.norm(normals[near], axis=1, keepdims=True)
         offset = vertices[own] - vertices[near]
-        height = (offset * unit).sum(1)
-        over[own] = (height > 0) & ((offset**2).sum(1) - height**2 < _COVERED**2)
+        height = (offset * normals[near]).sum(1)
+        covering.append(own[(height > 0) & ((offset**2).sum(1) - height**2 < _COVERED**2)])
         start += count
-    return over
+    return tuple(covering)
 
 
 def _colour(pairs: np.ndarray, count: int) -> list[list[int]]:

@@ -14,6 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+# Three arrays of coordinates: XLA's CPU backend is several times slower over a last axis of three.
+Columns = tuple[Array, Array, Array]
+
 # How many points are compared with all vertices at a time: their distances stay in the cache.
 _BLOCK = 16
 # Metres: a plane holds only so far around its point, and a vertex deeper than this is on the other side of a limb.
@@ -85,88 +88,81 @@ def find_planes(positions: Float[Array, "n 3"], surface: Surface) -> Int[Array, 
     return jnp.stack([nearest(positions, points) for points in surface.points])
 
 
-def take_planes(surface: Surface, planes: Int[Array, "g n"]) -> Surface:
-    """The points and normals that `find_planes` found, as columns (g, 3, n)."""
+def take_planes(surface: Surface, planes: Int[Array, "g n"]) -> tuple[Columns, Columns]:
+    """The points and normals that `find_planes` found, each as columns of shape (g, n)."""
     group = jnp.arange(planes.shape[0])[:, None]
-    return jax.tree.map(lambda x: jnp.moveaxis(x[group, planes], 2, 1), surface)
+    return columns(surface.points[group, planes]), columns(surface.normals[group, planes])
 
 
 def push_out(
-    positions: Float[Array, "3 n"],
-    previous: Float[Array, "3 n"],
-    planes: Surface,
-    moved: Float[Array, "g 3 n"],
+    x: Columns,
+    previous: Columns,
+    points: Columns,
+    normals: Columns,
+    moved: Columns,
     clearance: Float[Array, " n"],
     friction: Float[Array, " n"],
-) -> Float[Array, "3 n"]:
-    """Positions (3, n) moved out of the half-spaces behind planes (g, 3, n) with unit normals, one group after the
-    other.
+) -> Columns:
+    """Positions moved out of the half-spaces behind planes with unit normals, one group of planes after the other.
 
-    `previous` (3, n) are the positions before the step and `moved` (g, 3, n) how far the surface went in it: friction
-    takes away up to the vertex's share of the slip between them (Coulomb, at the level of positions). Coordinates are
-    columns, because XLA's CPU backend does not vectorise over a last axis of three.
+    `previous` are the positions before the step; points, normals and `moved`, how far the surface went in the step,
+    have columns (g, n). Friction takes away up to the vertex's share of the slip between vertex and surface (Coulomb,
+    at the level of positions).
     """
 
-    def group(x: Array, inputs: tuple[Array, Array, Array]) -> tuple[Array, None]:
+    def group(x: Columns, inputs: tuple[Columns, Columns, Columns]) -> tuple[Columns, None]:
         point, normal, carried = inputs
-        offset = x - point
-        height = _dot(offset, normal)
-        aside = _dot(offset, offset) - height * height
+        offset = _minus(x, point)
+        height = dot(offset, normal)
+        aside = dot(offset, offset) - height * height
         held = (aside < _PLANE_RADIUS**2) & (height > -_DEEPEST)
         depth = jnp.where(held, jnp.maximum(clearance - height, 0), 0.0)
-        slip = x - previous - carried
-        slip = slip - _dot(slip, normal)[None] * normal
-        kept = jnp.minimum(friction * depth * jax.lax.rsqrt(_dot(slip, slip) + 1e-18), 1.0)
-        return x + depth[None] * normal - kept[None] * slip, None
+        slip = _minus(_minus(x, previous), carried)
+        slip = along(slip, -dot(slip, normal), normal)
+        kept = jnp.minimum(friction * depth * jax.lax.rsqrt(dot(slip, slip) + 1e-18), 1.0)
+        return along(along(x, depth, normal), -kept, slip), None
 
-    return jax.lax.scan(group, positions, (planes.points, planes.normals, moved))[0]
-
-
-def push_out_of_capsules(positions: Float[Array, "3 n"], capsules: Capsules) -> Float[Array, "3 n"]:
-    """Positions (3, n) moved out of capsules, one after the other."""
-
-    def capsule(x: Array, inputs: Capsules) -> tuple[Array, None]:
-        axis = (inputs.end - inputs.begin)[:, None]
-        offset = x - inputs.begin[:, None]
-        share = jnp.clip(_dot(offset, axis) / (_dot(axis, axis) + 1e-12), 0, 1)
-        away = offset - share[None] * axis
-        inverse = jax.lax.rsqrt(_dot(away, away) + 1e-18)
-        return x + jnp.maximum(inputs.radii * inverse - 1, 0)[None] * away, None
-
-    return jax.lax.scan(capsule, positions, capsules)[0]
+    return jax.lax.scan(group, x, (points, normals, moved))[0]
 
 
-def _dot(a: Array, b: Array) -> Array:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def push_out_of_capsules(x: Columns, capsules: Capsules) -> Columns:
+    """Positions moved out of capsules, one after the other."""
+
+    def capsule(x: Columns, inputs: Capsules) -> tuple[Columns, None]:
+        begin, axis = columns(inputs.begin), columns(inputs.end - inputs.begin)
+        offset = _minus(x, begin)
+        share = jnp.clip(dot(offset, axis) / (dot(axis, axis) + 1e-12), 0, 1)
+        away = along(offset, -share, axis)
+        lacking = jnp.maximum(inputs.radii * jax.lax.rsqrt(dot(away, away) + 1e-18) - 1, 0)
+        return along(x, lacking, away), None
+
+    return jax.lax.scan(capsule, x, capsules)[0]
 
 
-def find_inner(positions: Float[Array, "n 3"], pieces: tuple[int, ...]) -> Int[Array, " n"]:
-    """For each vertex (n, 3) the nearest one of the pieces before its own, which it is worn over; itself where there
-    is none. `pieces` says how many vertices each has, in the order in which they are worn."""
-    found, start = [], 0
-    for count in pieces:
-        own = slice(start, start + count)
-        found.append(nearest(positions[own], positions[:start]) if start else jnp.arange(count, dtype=jnp.int32))
+def find_inner(
+    positions: Float[Array, "n 3"], pieces: tuple[int, ...], covering: tuple[Int[Array, " _c"], ...]
+) -> Int[Array, " n"]:
+    """For the vertices `covering` of each piece the nearest one of the pieces before it, which they are worn over;
+    for the others (n,) themselves. `pieces` says how many vertices each has, in the order in which they are worn."""
+    inner = jnp.arange(positions.shape[0], dtype=jnp.int32)
+    start = 0
+    for count, own in zip(pieces, covering, strict=True):
+        if own.shape[0]:
+            inner = inner.at[own].set(nearest(positions[own], positions[:start]))
         start += count
-    return jnp.concatenate(found)
+    return inner
 
 
-def keep_outside(
-    positions: Float[Array, "n 3"],
-    inner: Int[Array, " n"],
-    normals: Float[Array, "n 3"],
-    over: Float[Array, " n"],
-    gap: float,
-) -> Float[Array, "n 3"]:
-    """Positions (n, 3) moved to `gap` metres outside the planes of the vertices `inner` (n,) that they are worn over,
-    whose unit normals are rows of `normals`; `over` (n,) is 0 where that does not hold."""
-    point, normal = positions[inner].T, normals[inner].T
-    offset = positions.T - point
-    height = _dot(offset, normal)
-    aside = _dot(offset, offset) - height * height
-    held = (aside < _LAYER_RADIUS**2) & (height > -_LAYER_RADIUS)
-    depth = jnp.where(held, jnp.maximum(gap - height, 0), 0.0) * over
-    return positions + (depth[None] * normal).T
+def keep_outside(x: Columns, inner: Int[Array, " n"], normals: Columns, gap: float) -> Columns:
+    """Positions moved to `gap` metres outside the planes of the vertices `inner` (n,) that they are worn over, whose
+    unit normals are `normals`; a vertex that is its own inner one stays."""
+    normal = take(normals, inner)
+    offset = _minus(x, take(x, inner))
+    height = dot(offset, normal)
+    aside = dot(offset, offset) - height * height
+    over = inner != jnp.arange(inner.shape[0], dtype=inner.dtype)
+    held = over & (aside < _LAYER_RADIUS**2) & (height > -_LAYER_RADIUS)
+    return along(x, jnp.where(held, jnp.maximum(gap - height, 0), 0.0), normal)
 
 
 def find_neighbours(
@@ -182,20 +178,38 @@ def find_neighbours(
 
 
 def separate(
-    positions: Float[Array, "n 3"],
-    neighbours: Int[Array, " n"],
-    rest: Float[Array, "n 3"],
-    free: Float[Array, " n"],
-    distance: float,
-) -> Float[Array, "n 3"]:
-    """Positions (n, 3) moved away from `neighbours` (n,) that are nearer than `distance` metres, but not in the
-    pattern.
+    x: Columns, neighbours: Int[Array, " n"], rest: Columns, free: Float[Array, " n"], distance: float
+) -> Columns:
+    """Positions moved away from `neighbours` (n,) that are nearer than `distance` metres, but not in the pattern.
 
     Each of the two goes half the way (each computes its own half), all of it where the other is sewn on (`free` 0).
     """
-    offset = positions - positions[neighbours]
-    length = jnp.sqrt(jnp.sum(offset * offset, axis=1) + 1e-18)
-    between = jnp.sum((rest - rest[neighbours]) ** 2, axis=1)
-    lacking = jnp.where(between > distance**2, jnp.maximum(distance - length, 0), 0.0)
-    share = lacking * free / jnp.maximum(free + free[neighbours], 1e-9)
-    return positions + (share / length)[:, None] * offset
+    offset = _minus(x, take(x, neighbours))
+    apart = _minus(rest, take(rest, neighbours))
+    inverse = jax.lax.rsqrt(dot(offset, offset) + 1e-18)
+    lacking = jnp.where(dot(apart, apart) > distance**2, jnp.maximum(distance * inverse - 1, 0), 0.0)
+    return along(x, lacking * free / jnp.maximum(free + free[neighbours], 1e-9), offset)
+
+
+def columns(rows: Float[Array, "*s 3"]) -> Columns:
+    """Vectors (..., 3) as three arrays (...,) of coordinates."""
+    return rows[..., 0], rows[..., 1], rows[..., 2]
+
+
+def take(x: Columns, index: Int[Array, "*s"]) -> Columns:
+    """Vectors by number; all numbers must be within bounds."""
+    return tuple(c.at[index].get(mode="promise_in_bounds") for c in x)
+
+
+def dot(a: Columns, b: Columns) -> Array:
+    """Scalar products."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def along(x: Columns, factor: Array, direction: Columns) -> Columns:
+    """x + factor direction."""
+    return tuple(c + factor * d for c, d in zip(x, direction, strict=True))
+
+
+def _minus(a: Columns, b: Columns) -> Columns:
+    return tuple(c - d for c, d in zip(a, b, strict=True))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from collections.abc import Callable
 
 import flax.struct
 import jax
@@ -17,7 +18,7 @@ from jaxtyping import Array, Float
 
 from avatarjax.physics import contacts
 from avatarjax.physics.cloth import Cloth
-from avatarjax.physics.contacts import Capsules, Surface
+from avatarjax.physics.contacts import Capsules, Columns, Surface, columns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,14 +68,16 @@ class Drive:
 def step(cloth: Cloth, state: ClothState, start: Drive, end: Drive, config: XPBDConfig = XPBDConfig()) -> ClothState:
     """The cloth one frame later, while what it hangs on goes from `start` to `end`."""
     part = config.substeps // config.refreshes
-    neighbours = None
+    touching = None
     if config.distance > 0:
-        neighbours = contacts.find_neighbours(state.positions, cloth.rest, cloth.pieces, config.distance)
+        x = state.positions
+        neighbours = contacts.find_neighbours(x, cloth.rest, cloth.pieces, config.distance)
+        touching = neighbours, contacts.find_inner(x, cloth.pieces, cloth.covering)
 
     def refresh(state: ClothState, k: Array) -> tuple[ClothState, None]:
         low = jax.tree.map(lambda a, b: a + (b - a) * (k / config.refreshes), start, end)
         high = jax.tree.map(lambda a, b: a + (b - a) * ((k + 1) / config.refreshes), start, end)
-        return _part(cloth, state, low, high, neighbours, config, part), None
+        return _part(cloth, state, low, high, touching, config, part), None
 
     return jax.lax.scan(refresh, state, jnp.arange(config.refreshes, dtype=jnp.float32))[0]
 
@@ -97,12 +100,13 @@ def simulate(
 
 def vertex_normals(positions: Float[Array, "n 3"], faces: Array) -> Float[Array, "n 3"]:
     """Unit normals (n, 3) of a mesh, weighted by area."""
-    a, b, c = (positions[faces[:, k]] for k in range(3))
-    flat = jnp.cross(b - a, c - a)
-    total = jnp.zeros_like(positions)
-    for k in range(3):
-        total = total.at[faces[:, k]].add(flat)
-    return total / jnp.sqrt(jnp.sum(total * total, axis=1, keepdims=True) + 1e-18)
+    a, b, c = (columns(positions[faces[:, k]]) for k in range(3))
+    p, q = (tuple(v - u for u, v in zip(a, other, strict=True)) for other in (b, c))
+    flat = p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+    corners = faces.T.reshape(-1)
+    total = tuple(jnp.zeros(positions.shape[0]).at[corners].add(jnp.tile(f, 3)) for f in flat)
+    inverse = jax.lax.rsqrt(contacts.dot(total, total) + 1e-18)
+    return jnp.stack([t * inverse for t in total], axis=1)
 
 
 def _part(
@@ -110,85 +114,100 @@ def _part(
     state: ClothState,
     start: Drive,
     end: Drive,
-    neighbours: Array | None,
+    touching: tuple[Array, Array] | None,
     config: XPBDConfig,
     steps: int,
 ) -> ClothState:
-    """`steps` steps with the contacts that are near at their beginning."""
+    """`steps` steps with the solid surfaces that are near at their beginning; `touching` are the neighbours and inner
+    vertices of the cloth itself."""
     dt = 1 / (config.fps * config.substeps)
     planes = contacts.find_planes(state.positions, start.surface)
     low, high = contacts.take_planes(start.surface, planes), contacts.take_planes(end.surface, planes)
-    moved = (high.points - low.points) / steps
-    normals = vertex_normals(state.positions, cloth.faces)
-    free = (cloth.inverse_masses > 0).astype(jnp.float32)
-    loose = free[:, None] > 0
-    carried = (end.targets - start.targets) / (steps * dt)
+    moved = jax.tree.map(lambda a, b: (b - a) / steps, low[0], high[0])
+    normals = columns(vertex_normals(state.positions, cloth.faces))
+    rest = columns(cloth.rest)
+    loose = cloth.inverse_masses > 0
+    free = loose.astype(jnp.float32)
+    targets = columns(start.targets), columns(end.targets)
+    carried = jax.tree.map(lambda a, b: (b - a) / (steps * dt), *targets)
     slower = (1 - config.damping) ** dt
-    inner = contacts.find_inner(state.positions, cloth.pieces) if config.distance > 0 else None
+    solve = _pair_solver(cloth, dt)
 
-    def one(state: ClothState, k: Array) -> tuple[ClothState, None]:
+    def one(carry: tuple[Columns, Columns], k: Array) -> tuple[tuple[Columns, Columns], None]:
+        before, velocity = carry
         share = (k + 1) / steps
 
-        def between(a: Array, b: Array) -> Array:
-            return a + (b - a) * share
+        def between(a: typing.Any, b: typing.Any) -> typing.Any:
+            return jax.tree.map(lambda a, b: a + (b - a) * share, a, b)
 
-        target = between(start.targets, end.targets)
-        velocity = state.velocities + jnp.asarray(config.gravity)[None] * dt
-        velocity = _air(velocity - jnp.asarray(config.wind)[None], normals, cloth.drag, dt)
-        velocity = (velocity + jnp.asarray(config.wind)[None]) * slower
-        before = state.positions
-        x = jnp.where(loose, before + velocity * dt, target)
-        x = _solve_pairs(cloth, x, dt)
-        x = _tie(x, x[cloth.tether], cloth.tether_length)
-        if neighbours is not None:
-            x = contacts.separate(x, neighbours, cloth.rest, free, config.distance)
-            x = contacts.keep_outside(x, inner, normals, cloth.over, config.distance)
+        target = between(*targets)
+        velocity = tuple(v + g * dt - w for v, g, w in zip(velocity, config.gravity, config.wind, strict=True))
+        velocity = _air(velocity, normals, cloth.drag, dt)
+        velocity = tuple((v + w) * slower for v, w in zip(velocity, config.wind, strict=True))
+        x = _where(loose, contacts.along(before, jnp.asarray(dt), velocity), target)
+        x = solve(x)
+        x = _tie(x, contacts.take(x, cloth.tether), cloth.tether_length)
+        if touching is not None:
+            x = contacts.separate(x, touching[0], rest, free, config.distance)
+            x = contacts.keep_outside(x, touching[1], normals, config.distance)
         x = _tie(x, target, cloth.reach)
-        columns = contacts.push_out_of_capsules(x.T, jax.tree.map(between, start.capsules, end.capsules))
-        points, lean = between(low.points, high.points), between(low.normals, high.normals)
-        lean = lean * jax.lax.rsqrt(jnp.sum(lean * lean, axis=1, keepdims=True) + 1e-12)
-        columns = contacts.push_out(columns, before.T, Surface(points, lean), moved, cloth.clearance, cloth.friction)
-        x = columns.T.at[:, 1].max(cloth.clearance)
-        x = jnp.where(loose, x, target)
-        velocity = (x - before) / dt
-        against = velocity - carried
-        speed = jnp.sqrt(jnp.sum(against * against, axis=1, keepdims=True) + 1e-12)
-        velocity = carried + against * jnp.minimum(1.0, config.top_speed / speed)
-        return ClothState(x, velocity), None
+        x = contacts.push_out_of_capsules(x, between(start.capsules, end.capsules))
+        points, lean = between(low, high)
+        inverse = jax.lax.rsqrt(contacts.dot(lean, lean) + 1e-12)
+        lean = tuple(c * inverse for c in lean)
+        x = contacts.push_out(x, before, points, lean, moved, cloth.clearance, cloth.friction)
+        x = _where(loose, (x[0], jnp.maximum(x[1], cloth.clearance), x[2]), target)
+        against = tuple((a - b) / dt - c for a, b, c in zip(x, before, carried, strict=True))
+        speed = jax.lax.rsqrt(contacts.dot(against, against) + 1e-12)
+        return (x, contacts.along(carried, jnp.minimum(1.0, config.top_speed * speed), against)), None
 
-    return jax.lax.scan(one, state, jnp.arange(steps, dtype=jnp.float32))[0]
+    carry = columns(state.positions), columns(state.velocities)
+    (x, velocity), _ = jax.lax.scan(one, carry, jnp.arange(steps, dtype=jnp.float32))
+    return ClothState(jnp.stack(x, axis=1), jnp.stack(velocity, axis=1))
 
 
-def _solve_pairs(cloth: Cloth, x: Array, dt: float) -> Array:
+def _pair_solver(cloth: Cloth, dt: float) -> Callable[[Columns], Columns]:
     """One pass over all distance constraints, colour after colour (Macklin et al. 2016, Eq. 18 with lambda 0)."""
+    # Pairs that fill a colour up name a vertex after the last, which has no mass.
+    masses = jnp.append(cloth.inverse_masses, 0.0)[cloth.pairs]
+    stiffness = 1 / (masses[..., 0] + masses[..., 1] + cloth.compliances / dt**2 + 1e-12)
+    inputs = cloth.pairs[..., 0], cloth.pairs[..., 1], cloth.lengths, masses * stiffness[..., None]
 
-    def colour(x: Array, inputs: tuple[Array, Array, Array]) -> tuple[Array, None]:
-        pair, length, compliance = inputs
-        a, b = pair[:, 0], pair[:, 1]
-        offset = x.at[a].get(mode="clip") - x.at[b].get(mode="clip")
-        apart = jnp.sqrt(jnp.sum(offset * offset, axis=1) + 1e-18)
-        wa = cloth.inverse_masses.at[a].get(mode="clip")
-        wb = cloth.inverse_masses.at[b].get(mode="clip")
-        multiplier = (length - apart) / ((wa + wb + compliance / dt**2 + 1e-12) * apart)
-        shift = multiplier[:, None] * offset
-        x = x.at[a].add(wa[:, None] * shift, mode="drop").at[b].add(-wb[:, None] * shift, mode="drop")
-        return x, None
+    def colour(x: Columns, inputs: tuple[Array, Array, Array, Array]) -> tuple[Columns, None]:
+        a, b, length, weight = inputs
+        offset = tuple(p - q for p, q in zip(contacts.take(x, a), contacts.take(x, b), strict=True))
+        lacking = length * jax.lax.rsqrt(contacts.dot(offset, offset) + 1e-18) - 1
+        up, down = weight[:, 0] * lacking, weight[:, 1] * lacking
+        return tuple(
+            c.at[a].add(up * d, mode="promise_in_bounds").at[b].add(-down * d, mode="promise_in_bounds")
+            for c, d in zip(x, offset, strict=True)
+        ), None
 
-    return jax.lax.scan(colour, x, (cloth.pairs, cloth.lengths, cloth.compliances))[0]
+    def solve(x: Columns) -> Columns:
+        padded = tuple(jnp.append(c, 0.0) for c in x)
+        return tuple(c[:-1] for c in jax.lax.scan(colour, padded, inputs)[0])
+
+    return solve
 
 
-def _tie(x: Array, anchor: Array, length: Array) -> Array:
+def _where(condition: Array, a: Columns, b: Columns) -> Columns:
+    return tuple(jnp.where(condition, p, q) for p, q in zip(a, b, strict=True))
+
+
+def _tie(x: Columns, anchor: Columns, length: Array) -> Columns:
     """Pull vertices back to at most `length` from their anchors."""
-    offset = x - anchor
-    apart = jnp.sqrt(jnp.sum(offset * offset, axis=1) + 1e-18)
-    return anchor + offset * jnp.minimum(1.0, length / apart)[:, None]
+    offset = tuple(p - q for p, q in zip(x, anchor, strict=True))
+    inverse = jax.lax.rsqrt(contacts.dot(offset, offset) + 1e-18)
+    return contacts.along(anchor, jnp.minimum(1.0, length * inverse), offset)
 
 
-def _air(velocity: Array, normals: Array, drag: Array, dt: float) -> Array:
+def _air(velocity: Columns, normals: Columns, drag: Array, dt: float) -> Columns:
     """Velocity against the air after `dt` of quadratic drag, implicit and so never reversed; along the sheet a tenth
     of that across it."""
-    across = jnp.sum(velocity * normals, axis=1, keepdims=True)
-    along = velocity - across * normals
-    speed = jnp.sqrt(jnp.sum(along * along, axis=1, keepdims=True) + 1e-12)
-    drag = drag[:, None] * dt
-    return across / (1 + drag * jnp.abs(across)) * normals + along / (1 + 0.1 * drag * speed)
+    across = contacts.dot(velocity, normals)
+    flat = contacts.along(velocity, -across, normals)
+    speed = jnp.sqrt(contacts.dot(flat, flat) + 1e-12)
+    drag = drag * dt
+    slowed = 1 / (1 + 0.1 * drag * speed)
+    across = across / (1 + drag * jnp.abs(across))
+    return tuple(f * slowed + across * n for f, n in zip(flat, normals, strict=True))
