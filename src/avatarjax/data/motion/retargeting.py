@@ -2,39 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import os
-import struct
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
+
+from avatarjax.data.importers import gltf_file
 
 FPS = 30.0
 # The emote skeletons are exported in centimetres below a root that is in metres.
 _CHILD_UNIT = 0.01
 # How much of a bone's own turn is kept, against its parent's: the emotes' heads and collar bones rest differently.
 _SHARES = {"Head": 0.5, "Shoulder": 0.3}
-_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-
-
-def read_glb(path: str | os.PathLike) -> tuple[dict, bytes]:
-    """The JSON document and the binary chunk of a binary glTF 2.0 file; raises ValueError where it is none."""
-    raw = Path(path).read_bytes()
-    if raw[:4] != b"glTF":
-        raise ValueError(f"{path} is not a binary glTF file: it starts with {raw[:4]!r}")
-    json_length = struct.unpack("<I", raw[12:16])[0]
-    return json.loads(raw[20 : 20 + json_length]), raw[28 + json_length :]
-
-
-def _accessor(document: dict, blob: bytes, index: int) -> np.ndarray:
-    accessor = document["accessors"][index]
-    view = document["bufferViews"][accessor["bufferView"]]
-    width = _COMPONENTS[accessor["type"]]
-    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    values = np.frombuffer(blob, "<f4", accessor["count"] * width, start)
-    return values.reshape(-1, width).astype(np.float64)
 
 
 def bone_orientations(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -43,14 +23,14 @@ def bone_orientations(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], n
 
     Reads the first animation of a binary glTF file of the Decentraland emotes; bone names lose their `Avatar_` prefix.
     """
-    document, blob = read_glb(path)
-    nodes, animation = document["nodes"], document["animations"][0]
-    inputs = [_accessor(document, blob, s["input"])[:, 0] for s in animation["samplers"]]
+    file = gltf_file.read(path)
+    nodes, animation = file.entries("nodes"), file.entry("animations", 0)
+    inputs = [file.accessor(s["input"])[:, 0] for s in animation["samplers"]]
     start, end = min(t[0] for t in inputs), max(t[-1] for t in inputs)
     times = start + np.arange(round((end - start) * FPS) + 1) / FPS
     tracks = {}
     for channel in animation["channels"]:
-        values = _accessor(document, blob, animation["samplers"][channel["sampler"]]["output"])
+        values = file.accessor(animation["samplers"][channel["sampler"]]["output"])
         if channel["target"]["path"] == "rotation":
             # q and -q are one rotation: keep neighbours in one hemisphere so that interpolation takes the short way.
             flips = np.cumprod(np.r_[1.0, np.where((values[1:] * values[:-1]).sum(1) < 0, -1.0, 1.0)])

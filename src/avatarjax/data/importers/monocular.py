@@ -1,0 +1,307 @@
+"""A monocular video of a person with masks, cameras and poses, as SMAD takes it: one folder, read and written.
+
+video.mp4 or images/0000.png ...   RGB frames
+masks/0000.png ...                 foreground above 127
+cameras.json                       {"convention": "opencv", "width": w, "height": h,
+                                    "cameras": [{"intrinsics": 3x3, "world_to_camera": 4x4}, ...]}: one, or one a frame
+poses.npz                          rotations (f, j, 3, 3), root_rotation (f, 3, 3), root_translation (f, 3);
+                                   optional names (j,) and parents (j,)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import tempfile
+import typing
+import zipfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from avatarjax.cameras import Camera
+from avatarjax.data.importers import series
+from avatarjax.io import atomic, exr, video
+
+VIDEO, IMAGES, MASKS, CAMERAS, POSES = "video.mp4", "images", "masks", "cameras.json", "poses.npz"
+
+
+@typing.no_type_check
+@dataclasses.dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses over f frames in our axes and metres: rotations (f, j, 3, 3) of joints relative to their parents,
+    root_rotation (f, 3, 3) and root_translation (f, 3) to the world; names (j,) and parents (j,), -1 for a root, or
+    None.
+    """
+
+    rotations: Float[np.ndarray, "f j 3 3"]
+    root_rotation: Float[np.ndarray, "f 3 3"]
+    root_translation: Float[np.ndarray, "f 3"]
+    names: tuple[str, ...] | None = None
+    parents: tuple[int, ...] | None = None
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MonocularVideo:
+    """f frames of one person: masks (f, h, w), a camera (one, or a batch of f), poses, and RGB frames.
+
+    Iterate over `frames()` to decode one (h, w, 3) uint8 image at a time; `images()` holds all of them.
+    """
+
+    folder: Path
+    masks: np.ndarray
+    camera: Camera
+    poses: Poses
+    fps: float
+    _loaded: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.masks)
+
+    def frames(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        """The RGB frames in order, decoded as they are asked for."""
+        return iter(self._loaded) if self._loaded is not None else _decode(self.folder, self.camera)
+
+    def images(self) -> UInt8[np.ndarray, "f h w 3"]:
+        """All RGB frames at once."""
+        return self._loaded if self._loaded is not None else np.stack(list(self.frames()))
+
+    def camera_at(self, frame: int) -> Camera:
+        """The camera of one frame."""
+        if self.camera.world_to_camera.ndim == 2:
+            return self.camera
+        return self.camera.replace(
+            world_to_camera=self.camera.world_to_camera[frame], intrinsics=self.camera.intrinsics[frame]
+        )
+
+
+def load_monocular(folder: str | os.PathLike, *, lazy: bool = True) -> MonocularVideo:
+    """Load a monocular folder; with `lazy` RGB frames stay in their files until they are asked for.
+
+    Raises ValueError that names the file for whatever is missing or damaged, for sizes that differ, and where frames,
+    masks, cameras and poses do not count the same.
+    """
+    folder = Path(folder)
+    for name in (CAMERAS, POSES, MASKS):
+        if not (folder / name).exists():
+            raise ValueError(f"{folder} has no {name}: a monocular folder needs video.mp4 or images, masks, "
+                             "cameras.json and poses.npz")  # fmt: skip
+    camera = _read_cameras(folder / CAMERAS)
+    poses = _read_poses(folder / POSES)
+    masks = np.stack([_read_mask(path, camera) for path in _pictures(folder / MASKS)])
+    count, fps = _count(folder)
+    lengths = {"masks": len(masks), "poses": len(poses)}
+    if camera.world_to_camera.ndim == 3:
+        lengths["cameras"] = len(camera.world_to_camera)
+    for what, length in lengths.items():
+        if length != count:
+            raise ValueError(f"{folder} has {count} frames and {length} {what}: give one for each frame")
+    loaded = None if lazy else np.stack(list(_decode(folder, camera)))
+    return MonocularVideo(folder, masks, camera, poses, fps, loaded)
+
+
+def write_monocular(
+    folder: str | os.PathLike,
+    frames: Iterable[UInt8[np.ndarray, "h w 3"]],
+    masks: Iterable[Bool[np.ndarray, "h w"]],
+    camera: Camera,
+    poses: Poses,
+    *,
+    as_video: bool = False,
+    fps: int = 30,
+) -> None:
+    """Write a monocular folder, which appears whole or not at all; PNG frames without loss, or an H.264 video.
+
+    Raises ValueError where the folder exists and is not empty, or the data do not count the same.
+    """
+    folder = Path(folder)
+    if folder.exists() and any(folder.iterdir()):
+        raise ValueError(f"{folder} exists and is not empty: choose another folder, or delete it")
+    if as_video and (camera.width % 2 or camera.height % 2):
+        raise ValueError(f"a video needs even sides, got {camera.width}x{camera.height}: write images instead")
+    _check_poses(poses, folder / POSES)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        if as_video:
+            video.write_video(temporary / VIDEO, frames, fps=fps)
+        else:
+            for k, frame in enumerate(frames):
+                exr.write_png(temporary / IMAGES / f"{k:05d}.png", frame)
+        for k, mask in enumerate(masks):
+            exr.write_png(temporary / MASKS / f"{k:05d}.png", np.where(mask, 255, 0).astype(np.uint8)[..., None])
+        _write_cameras(temporary / CAMERAS, camera, fps)
+        arrays: dict[str, np.ndarray] = {
+            "rotations": poses.rotations,
+            "root_rotation": poses.root_rotation,
+            "root_translation": poses.root_translation,
+        }
+        if poses.names is not None:
+            arrays["names"] = np.array(poses.names)
+        if poses.parents is not None:
+            arrays["parents"] = np.array(poses.parents, np.int32)
+        np.savez(temporary / POSES, allow_pickle=False, **arrays)
+        # What was written is read again: it must be a whole folder before it gets its name.
+        for _ in load_monocular(temporary).frames():
+            pass
+        temporary.chmod(0o755)
+        if folder.exists():
+            folder.rmdir()
+        os.replace(temporary, folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _pictures(folder: Path) -> list[Path]:
+    paths = series.natural_order(folder.glob("*.png"))
+    if not paths:
+        raise ValueError(f"{folder} holds no .png files")
+    series.frame_numbers(paths)
+    return paths
+
+
+def _count(folder: Path) -> tuple[int, float]:
+    """Number of RGB frames and frames a second."""
+    path = folder / VIDEO
+    if path.is_file() and (folder / IMAGES).is_dir():
+        raise ValueError(f"{folder} has both {VIDEO} and {IMAGES}: keep one")
+    if (folder / IMAGES).is_dir():
+        return len(_pictures(folder / IMAGES)), _stated_fps(folder / CAMERAS)
+    if not path.is_file():
+        raise ValueError(f"{folder} has neither {VIDEO} nor {IMAGES}")
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            count = sum(packet.pts is not None for packet in container.demux(stream))
+            return count, float(stream.average_rate or 30)
+    except (av.FFmpegError, IndexError) as error:
+        raise ValueError(f"{path} cannot be read as a video ({error}): encode it again") from error
+
+
+def _decode(folder: Path, camera: Camera) -> Iterator[np.ndarray]:
+    expected = (camera.height, camera.width)
+    if (folder / IMAGES).is_dir():
+        for path in _pictures(folder / IMAGES):
+            pixels = exr.read_png(path)
+            if pixels.shape[:2] != expected or pixels.shape[2] < 3:
+                raise ValueError(f"{path} has shape {pixels.shape}, {CAMERAS} says {expected} RGB")
+            yield np.ascontiguousarray(pixels[..., :3])
+        return
+    import av
+
+    with av.open(str(folder / VIDEO)) as container:
+        for frame in container.decode(video=0):
+            pixels = frame.to_ndarray(format="rgb24")
+            if pixels.shape[:2] != expected:
+                raise ValueError(f"{folder / VIDEO} has frames of {pixels.shape[:2]}, {CAMERAS} says {expected}")
+            yield pixels
+
+
+def _read_mask(path: Path, camera: Camera) -> np.ndarray:
+    pixels = exr.read_png(path)
+    if pixels.shape[:2] != (camera.height, camera.width):
+        raise ValueError(f"{path} has shape {pixels.shape[:2]}, {CAMERAS} says {(camera.height, camera.width)}")
+    return pixels[..., 0] > 127
+
+
+def _json(path: Path) -> dict[str, typing.Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read as JSON ({error})") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must hold an object with width, height and cameras")
+    return content
+
+
+def _stated_fps(path: Path) -> float:
+    return float(_json(path).get("fps", 30.0))
+
+
+def _read_cameras(path: Path) -> Camera:
+    content = _json(path)
+    if content.get("convention", "opencv") != "opencv":
+        raise ValueError(
+            f"{path}: convention {content['convention']!r} is unknown: write opencv cameras (y down, z forward)"
+        )
+    try:
+        views = np.array([entry["world_to_camera"] for entry in content["cameras"]], np.float64)
+        intrinsics = np.array([entry["intrinsics"] for entry in content["cameras"]], np.float64)
+        width, height = int(content["width"]), int(content["height"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged ({error!r}): needs width, height and cameras") from error
+    if views.ndim != 3 or views.shape[1:] != (4, 4) or intrinsics.shape != (len(views), 3, 3):
+        raise ValueError(
+            f"{path}: world_to_camera must be 4x4 and intrinsics 3x3, got {views.shape}, {intrinsics.shape}"
+        )
+    rotations = views[:, :3, :3]
+    if not (np.isfinite(views).all() and np.isfinite(intrinsics).all()) or _not_rotations(rotations):
+        raise ValueError(f"{path}: a camera is not finite, or its rotation is none (no scale, no reflection)")
+    pair = jnp.asarray(views, jnp.float32), jnp.asarray(intrinsics, jnp.float32)
+    return Camera(*(pair if len(views) > 1 else (pair[0][0], pair[1][0])), width, height)
+
+
+def _write_cameras(path: Path, camera: Camera, fps: int) -> None:
+    views = np.asarray(camera.world_to_camera, np.float64).reshape(-1, 4, 4)
+    intrinsics = np.broadcast_to(np.asarray(camera.intrinsics, np.float64), (*camera.world_to_camera.shape[:-2], 3, 3))
+    entries = [
+        {"intrinsics": k.tolist(), "world_to_camera": w.tolist()}
+        for k, w in zip(intrinsics.reshape(-1, 3, 3), views, strict=True)
+    ]
+    content = {"convention": "opencv", "width": camera.width, "height": camera.height, "fps": fps, "cameras": entries}
+    atomic.write_text(path, json.dumps(content, indent=1))
+
+
+def _read_poses(path: Path) -> Poses:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (ValueError, OSError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"{path} is not a whole NPZ file of plain arrays ({error}): write it with numpy.savez"
+        ) from error
+    needed = ("rotations", "root_rotation", "root_translation")
+    missing = [name for name in needed if name not in arrays]
+    if missing:
+        raise ValueError(f"{path} has no {', '.join(missing)}, only {', '.join(arrays)}")
+    poses = Poses(
+        *(arrays[name].astype(np.float32) for name in needed),
+        names=tuple(str(name) for name in arrays["names"]) if "names" in arrays else None,
+        parents=tuple(int(parent) for parent in arrays["parents"]) if "parents" in arrays else None,
+    )
+    _check_poses(poses, path)
+    return poses
+
+
+def _check_poses(poses: Poses, path: Path) -> None:
+    shape = poses.rotations.shape
+    if poses.rotations.ndim != 4 or shape[2:] != (3, 3):
+        raise ValueError(f"{path}: rotations must be of shape (f, j, 3, 3), got {shape}")
+    if poses.root_rotation.shape != (shape[0], 3, 3) or poses.root_translation.shape != (shape[0], 3):
+        found = poses.root_rotation.shape, poses.root_translation.shape
+        raise ValueError(f"{path}: root_rotation and root_translation of shapes {found} do not fit {shape[0]} frames")
+    for name, values in (("rotations", poses.rotations), ("root_rotation", poses.root_rotation)):
+        if _not_rotations(values):
+            raise ValueError(f"{path}: {name} holds a matrix that is no rotation: orthonormalise it")
+    if not np.isfinite(poses.root_translation).all():
+        raise ValueError(f"{path}: root_translation is not finite")
+    for name, values in (("names", poses.names), ("parents", poses.parents)):
+        if values is not None and len(values) != shape[1]:
+            raise ValueError(f"{path}: {len(values)} {name} for {shape[1]} joints")
+
+
+def _not_rotations(matrices: np.ndarray) -> bool:
+    if not np.isfinite(matrices).all():
+        return True
+    products = np.swapaxes(matrices, -1, -2) @ matrices
+    return bool((np.abs(products - np.eye(3)) > 1e-2).any() or (np.linalg.det(matrices) < 0).any())

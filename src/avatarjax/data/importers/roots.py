@@ -1,0 +1,62 @@
+"""The point of a moving figure that everything is relative to: its waist by default (UNICA 3.3)."""
+
+from __future__ import annotations
+
+import typing
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from avatarjax.data.importers.gltf_animation import SkeletonAnimation
+from avatarjax.posmap.atlas import WAIST_BAND
+
+# How far from the axis of the body a vertex may be, as a share of the height: hands and sleeves do not count.
+_NEAR_AXIS = 0.12
+# A frame counts as standing from this share of the tallest frame's height, so that a raised arm does not define it.
+_STANDING = 0.8
+
+
+def roots(
+    vertices: Float[np.ndarray, "f v 3"],
+    root: typing.Any = "waist",
+    joints: SkeletonAnimation | None = None,
+    *,
+    source: str = "the mesh",
+) -> Float[np.ndarray, "f 3"]:
+    """The root (f, 3) of each frame, metres: the mean of one fixed set of vertices, or a joint's position.
+
+    `root` is "waist" (`waist_vertices`), vertex indices, or the name of a joint. Raises ValueError that names `source`
+    for an unknown joint or vertices that do not exist.
+    """
+    if isinstance(root, str) and root != "waist":
+        if joints is None:
+            raise ValueError(f"{source} has no joints: root={root!r} must be 'waist' or vertex indices")
+        if root not in joints.names:
+            raise ValueError(f"{source} has no joint {root!r}: choose one of {', '.join(joints.names)}, or 'waist'")
+        return np.ascontiguousarray(joints.positions[:, joints.names.index(root)])
+    indices = waist_vertices(vertices, source=source) if isinstance(root, str) else np.asarray(root)
+    count = vertices.shape[1]
+    if indices.ndim != 1 or not indices.size or indices.dtype.kind not in "iu":
+        raise ValueError(f"{source}: root must be 'waist', a joint's name or a list of vertex indices, got {root!r}")
+    if indices.min() < 0 or indices.max() >= count:
+        raise ValueError(f"{source}: root uses vertices {indices.min()} to {indices.max()}, the mesh has {count}")
+    return vertices[:, indices].mean(axis=1, dtype=np.float64).astype(np.float32)
+
+
+def waist_vertices(vertices: Float[np.ndarray, "f v 3"], *, source: str = "the mesh") -> Int[np.ndarray, " k"]:
+    """Indices (k,) of the vertices at the waist: 55 to 61 % of the height and near the axis of the body.
+
+    Chosen in the first frame whose height is at least 0.8 of the tallest frame's. Raises ValueError where no vertex
+    lies there.
+    """
+    heights = np.ptp(vertices[..., 1], axis=1)
+    figure = vertices[int(np.argmax(heights >= _STANDING * heights.max()))]
+    low, height = figure[:, 1].min(), np.ptp(figure[:, 1])
+    level = (figure[:, 1] - low) / max(float(height), 1e-9)
+    torso = figure[(level > 0.5) & (level < 0.75)]
+    axis = np.median(torso[:, [0, 2]], axis=0) if len(torso) else figure[:, [0, 2]].mean(axis=0)
+    near = np.linalg.norm(figure[:, [0, 2]] - axis, axis=1) < _NEAR_AXIS * height
+    found = np.flatnonzero((level > WAIST_BAND[0]) & (level < WAIST_BAND[1]) & near)
+    if not len(found):
+        raise ValueError(f"{source}: no vertex lies at the waist of its first standing frame: pass root=VERTEX_INDICES")
+    return found
