@@ -58,9 +58,11 @@ def _product(a: Array, b: Array) -> Array:
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
-def soft_length(distance: Float[Array, "*b"], longest: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """`distance` where it is under EXACT_REACH of `longest`; from there on it nears `longest` without passing it."""
-    start = EXACT_REACH * longest
+def soft_length(
+    distance: Float[Array, "*b"], longest: Float[Array, "*b"], share: float = EXACT_REACH
+) -> Float[Array, "*b"]:
+    """`distance` where it is under `share` of `longest`; from there on it nears `longest` without passing it."""
+    start = share * longest
     room = longest - start
     beyond = jnp.maximum(distance - start, 0)
     return jnp.minimum(distance, start) + room * (1 - jnp.exp(-beyond / room)) * (1 - 1e-4)

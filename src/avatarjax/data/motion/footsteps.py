@@ -35,7 +35,13 @@ _PIVOT_LAG = 0.8
 _HEEL_RISE = 1.2
 _DROP_LIMIT = 0.12
 _DROP_FREQUENCY = 22.0
-_REACH = 0.99
+_REACH = 0.98
+_SWING_REACH = 0.995
+# How far from under its hip, metres, a foot that steps by itself comes down.
+_LONGEST_STEP = 0.36
+# How high a swinging foot is at least: metres for each frame since it left the ground, and at most.
+_CLEARANCE = (0.018, 0.05)
+_OFFSET_PER_FRAME = 0.05
 _NEAR_GROUND = 0.012
 
 
@@ -84,8 +90,11 @@ class _State:
 
     ball: Array
     velocity: Array
+    rate: Array
+    tolerance: Array
     turn: Array
     spin: Array
+    toes: Array
     planted: Array
     armed: Array
     pinned_yaw: Array
@@ -93,6 +102,7 @@ class _State:
     standing: Array
     clock: Array
     apex: Array
+    aloft: Array
     short: Array
     drop: Array
     drop_rate: Array
@@ -274,27 +284,37 @@ def _step(rig: Rig, state: _State, plan: Plan, thighs: Array) -> tuple[_State, t
     armed = (state.armed | ~plan.contacts) & ~(short & patient)
 
     # A foot in the air that shall stand without a landing in the plan gets a clock of its own.
-    high = state.ball[:, 1] - ground > _NEAR_GROUND
+    high = (state.ball[:, 1] - ground > _NEAR_GROUND) | (miss > 0.03)
     fall = ~patient & plan.contacts & ~state.planted & (state.clock <= 0) & high
     clock = jnp.where(own_step, _STEP_FRAMES, jnp.where(fall, _LAND_FRAMES, state.clock))
-    clock = jnp.where(plan.contacts & ~patient & ~planted, jnp.maximum(clock - 1, 0), 0.0)
+    clocked = plan.contacts & ~patient & ~planted & (clock > 0)
+    clock = jnp.where(clocked, clock - 1, 0.0)
     apex = jnp.where(own_step, jnp.clip(0.3 * miss, 0.035, 0.1), jnp.where(fall, 0.0, state.apex))
     rising = (clock >= _STEP_FRAMES / 2) & (apex > 0)
 
     # In the air: the plan, plus an offset that is gone by the landing.
     lift = jnp.where(rising, apex, 0.0)
-    goal = plan.balls.at[:, 1].add(lift)
     velocity = plan.balls - plan.balls_before
-    frames = jnp.where(clock > 0, clock + 1, jnp.clip(plan.until + 1, 2.0, 9.0))
+    # A step of its own lands where the leg reaches, not where the figure will have come to rest.
+    away = (plan.balls - thighs) * jnp.array([[1.0, 0.0, 1.0]])
+    far = jnp.linalg.norm(away, axis=-1)
+    over = jnp.where(patient, 0.0, jnp.maximum(far - _LONGEST_STEP, 0.0)) / jnp.maximum(far, _LONGEST_STEP)
+    goal = (plan.balls - away * over[:, None]).at[:, 1].add(lift)
+    # A small offset goes quickly, so that the leg does not trail behind a run; a large one has time.
+    offset = state.ball - (goal - velocity)
+    patience = 3 + jnp.linalg.norm(offset, axis=-1) / _OFFSET_PER_FRAME
+    frames = jnp.where(clocked, clock + 1, jnp.clip(jnp.minimum(plan.until + 1, patience), 2.0, 9.0))
     frames_up = jnp.where(rising, clock + 1 - _STEP_FRAMES / 2 + 0.5, frames)
     remaining = jnp.stack([frames, frames_up, frames], axis=-1)
-    offset = state.ball - (goal - velocity)
-    offset, rate = _cubic(offset, state.velocity - velocity, remaining)
+    # The offset has a velocity of its own, so that it does not lag behind a plan that speeds up.
+    fresh = state.planted | (plan.tolerance != state.tolerance)
+    rate = jnp.where(fresh[:, None], state.velocity - velocity, state.rate)
+    offset, rate = _cubic(offset, rate, remaining)
     airborne, air_velocity = goal + offset, velocity + rate
 
     # Landing: the foot is pinned where it comes down.
     down = airborne[:, 1] - ground < _NEAR_GROUND
-    landing = ~planted & ~leaving & plan.contacts & armed & (clock <= 0) & down
+    landing = ~planted & ~leaving & plan.contacts & armed & (clock <= 0) & (down | clocked)
     yaw = footlock.yaw_of(state.turn)
     pinned_yaw = jnp.where(state.planted, state.pinned_yaw, yaw)
     planted = planted | landing
@@ -308,7 +328,7 @@ def _step(rig: Rig, state: _State, plan: Plan, thighs: Array) -> tuple[_State, t
 
     # The hips sink, softly, where a planted leg is too short with the heel a little up.
     aside = jnp.sum((thighs - ball)[:, ::2] ** 2, axis=-1)
-    highest = jnp.sqrt(jnp.maximum((reach + 0.05) ** 2 - aside, 0.01)) + ball[:, 1] + 0.03
+    highest = jnp.sqrt(jnp.maximum((reach + 0.1) ** 2 - aside, 0.01)) + ball[:, 1] + 0.03
     need = jnp.max(jnp.where(planted, thighs[:, 1] - highest, 0.0))
     drop, drop_rate = springs.critical_step(
         state.drop, state.drop_rate, jnp.clip(need, 0.0, _DROP_LIMIT), frequency=_DROP_FREQUENCY, dt=1 / _FPS
@@ -340,19 +360,33 @@ def _step(rig: Rig, state: _State, plan: Plan, thighs: Array) -> tuple[_State, t
     apart, spin = _cubic(apart, jnp.clip(state.spin - own, -0.5, 0.5), jnp.full((2, 1), 5.0))
     turn = rotations.multiply(rotations.from_axis_angle(apart), wanted)
 
+    # A leg that trails behind in the air is drawn in before its knee locks.
+    reaching = ball + footlock.rotate(turn, to_ankle) - hips
+    length = jnp.linalg.norm(reaching, axis=-1)
+    short_of = length - footlock.soft_length(length, reach * _SWING_REACH, 0.95)
+    drawn = ball - reaching * (short_of / length)[:, None]
+    ball = jnp.where(planted[:, None], ball, drawn)
+
     # Toes lie flat under a standing foot; no point of the sole goes under the ground.
     flat = rotations.multiply(_conjugate(turn), level(footlock.yaw_of(turn)))
     smooth = standing * standing * (3 - 2 * standing)
     toes = rotations.nlerp(plan.toes, flat, smooth)
+    toes = rotations.nlerp(state.toes, toes, 0.5 + 0.5 * smooth)
     chain = jnp.stack([turn, rotations.multiply(turn, toes)], axis=1)
     lowest = footlock.rotate(jnp.repeat(chain, half, axis=1), soles)[..., 1].min(axis=1)
-    height = jnp.where(planted, -lowest, jnp.maximum(ball[:, 1], -lowest))
+    aloft = jnp.where(planted, 0.0, state.aloft + 1)
+    highest = jnp.where(clocked, jnp.maximum(apex, 0.03), _CLEARANCE[1])
+    clear = jnp.minimum(jnp.minimum(_CLEARANCE[0] * aloft, highest), 0.02 * jnp.where(clocked, clock, plan.until))
+    height = jnp.where(planted, -lowest, jnp.maximum(ball[:, 1], clear - lowest))
     ball = ball.at[:, 1].set(height)
     state = _State(
         ball=ball,
         velocity=moving,
+        rate=rate,
+        tolerance=plan.tolerance,
         turn=turn,
         spin=own + spin,
+        toes=toes,
         planted=planted,
         armed=armed,
         pinned_yaw=pinned_yaw,
@@ -360,6 +394,7 @@ def _step(rig: Rig, state: _State, plan: Plan, thighs: Array) -> tuple[_State, t
         standing=standing,
         clock=clock,
         apex=apex,
+        aloft=aloft,
         short=~ok.any(axis=1),
         drop=drop,
         drop_rate=drop_rate,
@@ -380,8 +415,11 @@ def step_feet(
     state = _State(
         ball=first.balls_before,
         velocity=first.balls - first.balls_before,
+        rate=jnp.zeros((2, 3)),
+        tolerance=first.tolerance,
         turn=first.turns_before,
         spin=jnp.zeros((2, 3)),
+        toes=first.toes,
         planted=first.contacts,
         armed=jnp.ones(2, bool),
         pinned_yaw=footlock.yaw_of(first.turns),
@@ -389,6 +427,7 @@ def step_feet(
         standing=first.contacts.astype(jnp.float32),
         clock=zero,
         apex=zero,
+        aloft=zero,
         short=jnp.zeros(2, bool),
         drop=jnp.zeros(()),
         drop_rate=jnp.zeros(()),

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from avatarjax import rotations
 from avatarjax.data import skinning
 from avatarjax.data.body import Rig
-from avatarjax.data.motion import footlock, footsteps
+from avatarjax.data.motion import footsteps
 from avatarjax.data.motion.clips import Clips, sample
 from avatarjax.physics import springs
 
@@ -320,7 +320,9 @@ def _plan(rig: Rig, clips: Clips, config: LocomotionConfig, states: _State) -> f
     choices = [(running, now, before), (~running, stand, stand_before)]
     if clips.emotes is not None:
         played, played_before = (
-            footsteps.in_world(jax.vmap(functools.partial(_emote_feet, clips))(states.mode, states.clock - k), rest, facing)
+            footsteps.in_world(
+                jax.vmap(functools.partial(_emote_feet, clips))(states.mode, states.clock - k), rest, facing
+            )
             for k in (0, 1)
         )
         choices.append((states.mode > 1, played, played_before))
