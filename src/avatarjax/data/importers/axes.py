@@ -19,6 +19,8 @@ HEIGHTS = (0.5, 3.0)
 _AXES = ("x", "y", "z")
 # A figure clearly stands where its height exceeds both other extents by this factor; with its arms spread it is a draw.
 _CLEAR = 1.25
+# Two feet or a hem spread wider than a crown, by this factor where it is clear which end is which.
+_WIDER = 1.7
 
 
 def _direction(name: str, what: str) -> Float[np.ndarray, "3"]:
@@ -80,7 +82,7 @@ def choose(
             f"pass up={_AXES[longest]!r} and no axes, or check=False when the figure really lies down"
         )
     heights = vertices @ chosen[1]
-    if check and clear and _slim(heights, vertices) * 2 < _slim(-heights, vertices):
+    if check and clear and _slim(heights, vertices) * _WIDER < _slim(-heights, vertices):
         flipped = up[1:] if up.startswith("-") else f"-{up.lstrip('+')}"
         raise ValueError(
             f"{source}: with {up!r} up the figure stands on its head: pass up={flipped!r}, or check=False when it does"
@@ -94,7 +96,7 @@ def _standing_up(vertices: np.ndarray) -> str:
     lopsided = [_asymmetry(vertices[:, axis]) for axis in candidates]
     axis = int(candidates[np.argmax(lopsided)]) if len(candidates) > 1 else int(candidates[0])
     heights = vertices[:, axis]
-    upside_down = _slim(heights, vertices) * 1.7 < _slim(-heights, vertices)
+    upside_down = _slim(heights, vertices) * _WIDER < _slim(-heights, vertices)
     return f"{'-' if upside_down else ''}{_AXES[axis]}"
 
 

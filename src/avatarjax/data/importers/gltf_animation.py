@@ -65,8 +65,9 @@ def load_gltf_animation(path: str | os.PathLike, *, clip: str | None = None, fps
     or lists its clips.
     """
     file = gltf_file.read(Path(path))
-    times, tracks, name = sample_clip(file, clip, fps)
-    return skeleton(file, world_matrices(file, tracks, len(times)), fps, name)
+    with gltf_file.damage(path):
+        times, tracks, name = sample_clip(file, clip, fps)
+        return skeleton(file, world_matrices(file, tracks, len(times)), fps, name)
 
 
 def node_order(file: GltfFile) -> tuple[list[int], dict[int, int]]:
@@ -94,7 +95,7 @@ def node_order(file: GltfFile) -> tuple[list[int], dict[int, int]]:
 
 def node_name(file: GltfFile, index: int) -> str:
     """The name of a node, or node_INDEX."""
-    return file.entries("nodes")[index].get("name") or f"node_{index}"
+    return str(file.entries("nodes")[index].get("name") or f"node_{index}")
 
 
 def choose_clip(file: GltfFile, clip: str | None) -> dict[str, typing.Any] | None:
@@ -141,7 +142,7 @@ def sample_clip(
             raise ValueError(f"{file.path}: {len(output)} values for {len(keys)} keys of a channel: export it again")
         channels.append(((channel["target"]["node"], path), keys, output, interpolation))
     if not channels:
-        return np.zeros(1), {}, animation.get("name", "")
+        return np.zeros(1), {}, str(animation.get("name", ""))
     start = min(keys[0] for _, keys, _, _ in channels)
     end = max(keys[-1] for _, keys, _, _ in channels)
     # Keys are float32: a clip of two seconds may end a rounding error before 2.
@@ -150,7 +151,7 @@ def sample_clip(
         target: interpolate(keys, output, times, interpolation, rotation=target[1] == "rotation")
         for target, keys, output, interpolation in channels
     }
-    return times, tracks, animation.get("name", "")
+    return times, tracks, str(animation.get("name", ""))
 
 
 def interpolate(

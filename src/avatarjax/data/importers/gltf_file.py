@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import contextlib
 import dataclasses
 import functools
 import json
@@ -11,6 +12,7 @@ import os
 import struct
 import typing
 import urllib.parse
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +39,10 @@ class GltfFile:
 
     def entries(self, kind: str) -> list[dict[str, typing.Any]]:
         """The objects of one kind ("nodes", "meshes", ...), [] where there are none."""
-        return self.document.get(kind, [])
+        found = self.document.get(kind, [])
+        if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
+            raise ValueError(f"{self.path} is damaged: its {kind} are no list of objects")
+        return found
 
     def entry(self, kind: str, index: typing.Any) -> dict[str, typing.Any]:
         """One object of a kind; ValueError that names the file where there is none of that index."""
@@ -131,6 +136,15 @@ class GltfFile:
         return np.ndarray((count, width), dtype, data, start + offset, (stride, dtype.itemsize))
 
 
+@contextlib.contextmanager
+def damage(path: str | os.PathLike) -> Iterator[None]:
+    """Turns what a document with missing or misplaced entries leads to into a ValueError that names the file."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: an entry is missing or of the wrong kind ({error!r})") from error
+
+
 def read(path: str | os.PathLike, root: Path | None = None) -> GltfFile:
     """Parse a .glb or .gltf file; files that it names must lie in `root` (its folder by default).
 
@@ -155,7 +169,8 @@ def read(path: str | os.PathLike, root: Path | None = None) -> GltfFile:
         raise ValueError(f"{path} is no glTF document ({error!r}): export it again") from error
     if not version.startswith("2."):
         raise ValueError(f"{path} is glTF {version}: export it as glTF 2.0")
-    needed = [e for e in document.get("extensionsRequired", []) if e not in _HARMLESS and "materials" not in e]
+    required = document.get("extensionsRequired") or []
+    needed = [str(e) for e in required if e not in _HARMLESS and "materials" not in str(e)]
     if needed:
         raise ValueError(f"{path} needs the extensions {', '.join(needed)}: export it without compression")
     return GltfFile(path, document, chunk, root or path.parent)

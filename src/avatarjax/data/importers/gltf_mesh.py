@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import typing
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,15 +35,16 @@ def read(files: Sequence[Path], root: Path, clips: Sequence[str | None], frames:
     for path in files:
         file = gltf_file.read(path, root)
         for clip in clips:
-            times, tracks, name = gltf_animation.sample_clip(file, clip, gltf_animation.FPS)
-            frame, vertices = _evaluate(file, tracks, len(times))
+            with gltf_file.damage(path):
+                times, tracks, name = gltf_animation.sample_clip(file, clip, gltf_animation.FPS)
+                frame, vertices = _evaluate(file, tracks, len(times))
+                joints = None
+                if file.entries("skins"):
+                    world = gltf_animation.world_matrices(file, tracks, len(times))[frames]
+                    joints = gltf_animation.skeleton(file, world, gltf_animation.FPS, name)
             first = first or frame
             if first.vertices.shape != frame.vertices.shape or not np.array_equal(first.faces, frame.faces):
                 raise ValueError(f"{path} holds another mesh than {files[0]}: export every clip with the same mesh")
-            joints = None
-            if file.entries("skins"):
-                world = gltf_animation.world_matrices(file, tracks, len(times))[frames]
-                joints = gltf_animation.skeleton(file, world, gltf_animation.FPS, name)
             if not len(vertices[frames]):
                 raise ValueError(f"{path} has {len(times)} samples, none is left by start, stop and every")
             label = path.stem if len(files) > 1 else name or path.stem
@@ -68,8 +70,10 @@ def has_clips(path: Path) -> bool:
 
 def read_frame(path: Path, root: Path) -> RawFrame:
     """A glTF file at rest: its meshes where its nodes put them."""
-    frame, _ = _evaluate(gltf_file.read(path, root), {}, 1)
-    return frame
+    file = gltf_file.read(path, root)
+    with gltf_file.damage(path):
+        frame, vertices = _evaluate(file, {}, 1)
+    return dataclasses.replace(frame, vertices=vertices[0])
 
 
 def _evaluate(file: GltfFile, tracks: dict[tuple[int, str], np.ndarray], frames: int) -> tuple[RawFrame, np.ndarray]:

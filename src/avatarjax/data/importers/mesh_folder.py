@@ -158,14 +158,17 @@ def _read_ply(path: Path) -> RawFrame:
     except Exception as error:  # trimesh raises whatever its parser met
         raise ValueError(f"{path} cannot be read as PLY ({error}): export it again") from error
     vertices = check_vertices(np.asarray(content.get("vertices", np.zeros((0, 3)))), path)
-    faces = content.get("faces")
-    faces = check_faces(np.zeros((0, 3), int) if faces is None else np.asarray(faces), len(vertices), path)
+    polygons = content.get("faces")
+    polygons = np.zeros((0, 3), int) if polygons is None else polygons
+    faces = check_faces(np.asarray(trimesh.geometry.triangulate_quads(polygons)), len(vertices), path)
     data = content.get("metadata", {}).get("_ply_raw", {}).get("vertex", {}).get("data")
     uvs = None
-    if data is not None and data.dtype.names:
+    if data is not None:
+        # A dictionary of columns for ASCII files, a structured array for binary ones.
+        names = set(data) if isinstance(data, dict) else set(data.dtype.names or ())
         for u, v in (("s", "t"), ("u", "v"), ("texture_u", "texture_v")):
-            if {u, v} <= set(data.dtype.names):
-                uvs = np.stack([data[u], data[v]], axis=-1)
+            if {u, v} <= names:
+                uvs = np.stack([np.ravel(data[u]), np.ravel(data[v])], axis=-1)
     return RawFrame(vertices, faces, corner_uvs(uvs, faces, len(vertices), path))
 
 

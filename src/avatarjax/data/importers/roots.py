@@ -14,6 +14,8 @@ from avatarjax.posmap.atlas import WAIST_BAND
 _NEAR_AXIS = 0.12
 # A frame counts as standing from this share of the tallest frame's height, so that a raised arm does not define it.
 _STANDING = 0.8
+# A coarse mesh may have few vertices in the band: this many, the closest in height, then make the set.
+_FEWEST = 8
 
 
 def roots(
@@ -46,8 +48,8 @@ def roots(
 def waist_vertices(vertices: Float[np.ndarray, "f v 3"], *, source: str = "the mesh") -> Int[np.ndarray, " k"]:
     """Indices (k,) of the vertices at the waist: 55 to 61 % of the height and near the axis of the body.
 
-    Chosen in the first frame whose height is at least 0.8 of the tallest frame's. Raises ValueError where no vertex
-    lies there.
+    Chosen in the first frame whose height is at least 0.8 of the tallest frame's. Where fewer than eight lie there, the
+    eight closest in height are taken. Raises ValueError where no vertex near the axis is within a tenth of the height.
     """
     heights = np.ptp(vertices[..., 1], axis=1)
     figure = vertices[int(np.argmax(heights >= _STANDING * heights.max()))]
@@ -57,6 +59,11 @@ def waist_vertices(vertices: Float[np.ndarray, "f v 3"], *, source: str = "the m
     axis = np.median(torso[:, [0, 2]], axis=0) if len(torso) else figure[:, [0, 2]].mean(axis=0)
     near = np.linalg.norm(figure[:, [0, 2]] - axis, axis=1) < _NEAR_AXIS * height
     found = np.flatnonzero((level > WAIST_BAND[0]) & (level < WAIST_BAND[1]) & near)
+    if len(found) < _FEWEST:
+        away = np.where(near, np.abs(level - sum(WAIST_BAND) / 2), np.inf)
+        # Vertices of one height stay together, so that the set does not lean to one side.
+        reach = np.sort(away)[min(_FEWEST, len(away)) - 1] + 1e-4
+        found = np.flatnonzero(away <= min(reach, 0.1))
     if not len(found):
         raise ValueError(f"{source}: no vertex lies at the waist of its first standing frame: pass root=VERTEX_INDICES")
     return found
