@@ -54,6 +54,7 @@ class LocomotionConfig:
     look_limit: float = 0.5
     foot_lock: bool = True
     foot_lookahead: float = 0.05
+    pivot_lag: float = 0.8
     step_tolerance: float = 0.05
     emote_tolerance: float = 0.14
     emote_speed: float = 0.4
@@ -274,8 +275,7 @@ def simulate(
     Starts at the origin of the ground. `key` draws the phases of the gait; `heading` (yaw, radians) is where a figure
     looks whose first action is idle. `jax.vmap` over actions, keys and headings makes batches.
     """
-    look = np.zeros(len(rig.names), np.float32)
-    look[[rig.index(name) for name in ("Spine1", "Neck", "Head")]] = 1 / 3
+    look = _look(rig)
     state = initial_state(clips, actions[0], key, config, heading)
     step = functools.partial(_step, clips, config, look)
     _, ((quats, hips), states) = jax.lax.scan(step, state, actions)
@@ -289,6 +289,56 @@ def simulate(
         hips = hips.at[:, 1].add(lift)
     roots = jnp.stack([states.position[:, 0], jnp.zeros(len(actions)), states.position[:, 1]], axis=1)
     return Motion(quats, hips, transforms, roots, states.heading, states.speed)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def follow(
+    rig: Rig,
+    clips: Clips,
+    headings: Float[Array, " f"],
+    speeds: Float[Array, " f"],
+    phase: Float[Array, ""] | float = 0.0,
+    config: LocomotionConfig = LocomotionConfig(),
+) -> Motion:
+    """A run with given headings (f,), yaw in radians, and speeds (f,), metres a second, both smooth in time.
+
+    Starts at the origin, at `phase` (cycles) of the run's clip; the steps are as long as the speed makes them.
+    """
+    dt = 1 / config.fps
+    frames = headings.shape[0]
+    rates, pushes = jnp.gradient(headings) / dt, jnp.gradient(speeds) / dt
+    gaits = _gait(clips, speeds, config) * config.fps / clips.run.quats.shape[0]
+    effort = jnp.minimum(speeds / clips.run_speed, 1.0)
+    bank = jnp.clip(-config.lean_per_turn * rates * effort, -config.lean_limit, config.lean_limit)
+    pitch = jnp.clip(config.pitch_per_acceleration * pushes, -config.pitch_limit, config.pitch_limit)
+    moved = _forward(headings) * (speeds * dt)[:, None]
+    phases = phase + jnp.cumsum(gaits * dt) - gaits[0] * dt
+    still = jnp.zeros(frames)
+    states = _State(
+        heading=headings,
+        heading_rate=rates,
+        speed=speeds,
+        speed_rate=pushes,
+        position=jnp.cumsum(moved, axis=0) - moved[0][None],
+        phases=jnp.stack([still, phases], axis=1),
+        mode=jnp.ones(frames, jnp.int32),
+        clock=still,
+        lean=jnp.stack([pitch, bank], axis=1),
+        lean_rate=jnp.zeros((frames, 2)),
+        blend=jnp.zeros((frames, 1, 3)),
+        blend_rate=jnp.zeros((frames, 1, 3)),
+    )
+    look = _look(rig)
+    quats, hips = jax.vmap(lambda s: _place(sample(clips.run, s.phases[1]), s, config, look))(states)
+    quats, hips, transforms = footsteps.lock_feet(rig, quats, hips, _plan(rig, clips, config, states))
+    roots = jnp.stack([states.position[:, 0], still, states.position[:, 1]], axis=1)
+    return Motion(quats, hips, transforms, roots, headings, speeds)
+
+
+def _look(rig: Rig) -> np.ndarray:
+    look = np.zeros(len(rig.names), np.float32)
+    look[[rig.index(name) for name in ("Spine1", "Neck", "Head")]] = 1 / 3
+    return look
 
 
 def _plan(rig: Rig, clips: Clips, config: LocomotionConfig, states: _State) -> footsteps.Plan:
@@ -327,7 +377,8 @@ def _plan(rig: Rig, clips: Clips, config: LocomotionConfig, states: _State) -> f
         )
         choices.append((states.mode > 1, played, played_before))
         tolerance = jnp.where(states.mode > 1, config.emote_tolerance, tolerance)
-    return footsteps.plan(choices, tolerance)
+    pivot_lag = jnp.where(running, config.pivot_lag, jnp.pi)
+    return footsteps.plan(choices, tolerance, pivot_lag)
 
 
 def _forward(heading: Array) -> Array:
