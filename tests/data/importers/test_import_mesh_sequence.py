@@ -1,5 +1,6 @@
 """The door: every kind of folder gives the same sequence, axes and time are ours, and each mistake names its fix."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -7,9 +8,10 @@ import sys
 import import_figures as figures
 import numpy as np
 import pytest
+import trimesh
 
 from avatarjax import data
-from avatarjax.data.importers import axes
+from avatarjax.data.importers import axes, roots
 from avatarjax.io import exr
 
 FRAMES = 6
@@ -91,6 +93,33 @@ def test_the_root_is_the_waist(tmp_path, walk):
     for root, match in (([10**6], "the mesh has"), ("Hips", "has no joints"), ([], "vertex indices")):
         with pytest.raises(ValueError, match=match):
             load(tmp_path, root=root)
+
+
+def test_a_finely_meshed_patch_does_not_pull_the_waist(tmp_path, walk):
+    vertices, faces, _ = walk
+    points, triangles = vertices[0], faces
+    for _ in range(2):
+        points, triangles = trimesh.remesh.subdivide(points, triangles)
+    for _ in range(2):
+        middle = points[triangles].mean(axis=1)
+        patch = (np.abs(middle[:, 1] - 0.58 * figures.HEIGHT) < 0.1) & (middle[:, 2] > 0.09)
+        points, triangles = trimesh.remesh.subdivide(points, triangles, np.flatnonzero(patch))
+    np.savez(tmp_path / "a.npz", vertices=points, faces=triangles)
+    assert abs(load(tmp_path / "a.npz").roots[0, 2]) < 0.03
+    assert points[roots.waist_vertices(points[None].astype(np.float32)), 2].mean() > 0.05
+
+
+def test_arrays_that_do_not_fit_each_other_are_refused(tmp_path, walk):
+    vertices, faces, _ = walk
+    figures.write_frames(tmp_path, "npz", vertices, faces)
+    sequence = load(tmp_path)
+    for name, value in (
+        ("actions", sequence.actions[1:]),
+        ("faces", faces + 10**6),
+        ("roots", sequence.roots * np.nan),
+    ):
+        with pytest.raises(ValueError, match=r"entries, expected|faces must use|not finite"):
+            dataclasses.replace(sequence, **{name: value})
 
 
 def test_time_becomes_thirty_frames_a_second(tmp_path, walk):

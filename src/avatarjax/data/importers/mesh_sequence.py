@@ -127,7 +127,7 @@ def load_mesh_sequence(
         action_names=tuple(action_names),
         sequence=np.repeat(np.arange(len(parts), dtype=np.int32), [len(ids) for _, ids, _ in parts]),
         sequence_names=tuple(s.name for s in mesh.sequences),
-        roots=roots.roots(vertices, root, joints, source=mesh.source),
+        roots=roots.roots(vertices, faces, root, joints, source=mesh.source),
         joints=joints,
         source=mesh.source,
     )

@@ -20,6 +20,7 @@ _FEWEST = 8
 
 def roots(
     vertices: Float[np.ndarray, "f v 3"],
+    faces: Int[np.ndarray, "g 3"],
     root: typing.Any = "waist",
     joints: SkeletonAnimation | None = None,
     *,
@@ -27,8 +28,9 @@ def roots(
 ) -> Float[np.ndarray, "f 3"]:
     """The root (f, 3) of each frame, metres: the mean of one fixed set of vertices, or a joint's position.
 
-    `root` is "waist" (`waist_vertices`), vertex indices, or the name of a joint. Raises ValueError that names `source`
-    for an unknown joint or vertices that do not exist.
+    `root` is "waist" (`waist_vertices`, weighted by the surface around them, so that a finely meshed belt does not pull
+    it aside), vertex indices, or the name of a joint. Raises ValueError that names `source` for an unknown joint or
+    vertices that do not exist.
     """
     if isinstance(root, str) and root != "waist":
         if joints is None:
@@ -42,7 +44,12 @@ def roots(
         raise ValueError(f"{source}: root must be 'waist', a joint's name or a list of vertex indices, got {root!r}")
     if indices.min() < 0 or indices.max() >= count:
         raise ValueError(f"{source}: root uses vertices {indices.min()} to {indices.max()}, the mesh has {count}")
-    return vertices[:, indices].mean(axis=1, dtype=np.float64).astype(np.float32)
+    weights = np.ones(len(indices))
+    if isinstance(root, str):
+        a, b, c = (vertices[0, faces[:, k]].astype(np.float64) for k in range(3))
+        areas = np.bincount(faces.ravel(), np.repeat(np.linalg.norm(np.cross(b - a, c - a), axis=1), 3), count)
+        weights = areas[indices] if areas[indices].sum() > 0 else weights
+    return np.einsum("fkc,k->fc", vertices[:, indices], weights / weights.sum()).astype(np.float32)
 
 
 def waist_vertices(vertices: Float[np.ndarray, "f v 3"], *, source: str = "the mesh") -> Int[np.ndarray, " k"]:
