@@ -38,6 +38,8 @@ def tiny_spec():
         standing_views=2,
         image_size=32,
         script=(1,) * 10 + (2,) * 10,
+        cloth_steps=4,
+        vertices="float16",
     )
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from avatarjax import posmap
 from avatarjax.data import dataset
+from avatarjax.io import weights
 
 
 @pytest.fixture
@@ -25,9 +26,29 @@ def edit(folder, change):
     path.write_text(json.dumps(manifest))
 
 
-def test_it_is_built_alike_every_time(tiny_folder, tiny_spec, tmp_path):
-    dataset.build(tmp_path, tiny_spec, progress=False)
-    assert dataset.fingerprint(tmp_path) == dataset.fingerprint(tiny_folder)
+def test_an_interrupted_build_goes_on_and_ends_alike(folder, tiny_folder, tiny_spec):
+    """As if the process had been killed: no manifest, some clips not there, one file half written."""
+    whole = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").unlink()
+    (folder / "building.json").write_text(json.dumps({"version": dataset.VERSION, "spec": whole["spec"]}))
+    (folder / "clips" / ".train-003.x.safetensors").write_bytes(b"half")
+    kept = folder / "clips" / "held_out-002.safetensors"
+    before = kept.stat().st_mtime_ns
+    for name in ("train-003", "truth-000"):
+        (folder / "clips" / f"{name}.safetensors").unlink()
+    with pytest.raises(ValueError, match="no finished dataset"):
+        dataset.load(folder)
+    dataset.build(folder, tiny_spec, progress=False)
+    assert dataset.fingerprint(folder) == dataset.fingerprint(tiny_folder)
+    assert kept.stat().st_mtime_ns == before
+    assert not (folder / "building.json").exists()
+
+
+def test_what_another_spec_has_left_is_not_used(tmp_path, tiny_spec):
+    (tmp_path / "clips").mkdir()
+    (tmp_path / "clips" / "train-000.safetensors").write_bytes(b"other")
+    dataset._begin(tmp_path, tiny_spec)
+    assert not (tmp_path / "clips").exists()
 
 
 def test_it_matches_its_spec(tiny_folder, tiny_spec):
@@ -60,6 +81,14 @@ def test_held_out_motion_is_the_same_transitions_in_another_way(tiny_data):
     running = np.flatnonzero(train.actions[::60]) * 60
     closest = np.abs(held.texels[running, None] - train.texels[None, running]).mean((2, 3)).min(1)
     assert (closest > 1e-4).all()  # other phases of the gait; metres
+
+
+def test_vertices_lie_where_the_texels_do(tiny_folder, tiny_data):
+    """Kept as float16 relative to the root: right to half a millimetre, wherever in the world the figure is."""
+    arrays, _ = weights.load_arrays(tiny_folder / "clips" / "train-007.safetensors")
+    assert arrays["vertices"].dtype == np.float16
+    texels = posmap.encode(tiny_data.atlas, jnp.asarray(arrays["vertices"][-1], jnp.float32))
+    np.testing.assert_allclose(texels, arrays["texels"][-1], atol=6e-4)
 
 
 def near_opaque(alpha):
@@ -108,22 +137,23 @@ def test_cylinder_cameras_look_at_the_middle_from_one_distance():
 
 class TestDamage:
     def test_a_truncated_file_is_named(self, folder):
-        path = folder / "held_out.safetensors"
+        path = folder / "clips" / "held_out-004.safetensors"
         path.write_bytes(path.read_bytes()[:-10])
-        with pytest.raises(ValueError, match=r"held_out\.safetensors is damaged.*--stage data"):
+        with pytest.raises(ValueError, match=r"held_out-004\.safetensors is damaged.*--stage data"):
             dataset.load(folder)
 
-    def test_a_flipped_bit_is_noticed(self, folder):
-        path = folder / "train.safetensors"
+    def test_a_flipped_bit_is_noticed(self, folder, tiny_data):
+        view = int(tiny_data.train_images.view[0, 0])
+        path = folder / "images" / "train" / f"{0:05d}_{view:02d}.png"
         content = bytearray(path.read_bytes())
-        content[-100] ^= 1
+        content[-20] ^= 1
         path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"train\.safetensors is damaged"):
+        with pytest.raises(ValueError, match=r"\.png is damaged"):
             dataset.load(folder)
 
     def test_a_missing_file_is_named(self, folder):
-        (folder / "truth.safetensors").unlink()
-        with pytest.raises(ValueError, match=r"truth\.safetensors is missing: build it again"):
+        (folder / "clips" / "truth-000.safetensors").unlink()
+        with pytest.raises(ValueError, match=r"truth-000\.safetensors is missing: build it again"):
             dataset.load(folder)
 
     def test_a_folder_without_manifest_is_unfinished(self, folder, tiny_spec):
@@ -139,10 +169,10 @@ class TestDamage:
             '{"version": 1',
             "[]",
             "3",
-            '{"version": 1, "spec": {}}',
-            '{"version": 1, "spec": {}, "files": []}',
-            '{"version": 1, "spec": {"size": 32}, "files": {}}',
-            '{"version": 1, "spec": [], "files": {"a": 3}}',
+            '{"version": 3, "spec": {}}',
+            '{"version": 3, "spec": {}, "files": []}',
+            '{"version": 3, "spec": {"size": 32}, "files": {}}',
+            '{"version": 3, "spec": [], "files": {"a": 3}}',
         ],
     )
     def test_a_damaged_manifest_is_named(self, folder, tiny_spec, text):
@@ -151,7 +181,9 @@ class TestDamage:
         with pytest.raises(ValueError, match=r"manifest\.json is damaged.*--stage data"):
             dataset.load(folder)
 
-    @pytest.mark.parametrize("name", ["../secret.safetensors", "/etc/passwd", "sub/x.safetensors", "other.txt"])
+    @pytest.mark.parametrize(
+        "name", ["../secret.safetensors", "/etc/passwd", "clips/../../x.safetensors", "C:x", "a\\b"]
+    )
     def test_a_manifest_that_names_other_files_is_refused(self, folder, tiny_spec, name):
         edit(folder, lambda m: m["files"].update({name: {"bytes": 0, "sha256": ""}}))
         assert not dataset.matches(folder, tiny_spec)
@@ -166,7 +198,7 @@ class TestDamage:
 
 
 def test_other_data_have_another_fingerprint(folder, tiny_folder):
-    edit(folder, lambda m: m["files"]["train.safetensors"].update(sha256="0" * 64))
+    edit(folder, lambda m: m["files"]["clips/train-000.safetensors"].update(sha256="0" * 64))
     assert dataset.fingerprint(folder) != dataset.fingerprint(tiny_folder)
 
 

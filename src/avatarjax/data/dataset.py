@@ -64,7 +64,7 @@ class DatasetSpec:
     image_size: int
     script: tuple[int, ...]
     seed: int = 0
-    cloth_steps: int = 20
+    cloth_steps: int = 32
     vertices: typing.Literal["none", "float16", "float32"] = "none"
 
     def __post_init__(self):
@@ -162,13 +162,16 @@ def build(folder: Path, spec: DatasetSpec, *, progress: bool = True) -> None:
                 bar.update(frames)
 
         with concurrent.futures.ThreadPoolExecutor(_WORKERS) as pool:
-            jobs = []
-            for offset, (name, plan) in enumerate(plans.items()):
+            every = [(name, plan, k) for name, plan in plans.items() for k in range(len(plan.scripts))]
+            motions = sequences.simulate(
+                maker.avatar,
+                [plan.scripts[k] for _, plan, k in every],
+                np.concatenate([plan.headings for plan in plans.values()]),
                 # The report's script begins from standing, as a rollout does.
-                lead = 0 if name == "truth" else None
-                motions = sequences.simulate(maker.avatar, plan.scripts, plan.headings, spec.seed + 100 * offset, lead)
-                for k, motion in enumerate(motions):
-                    jobs.append(pool.submit(maker.clip, name, plan, k, motion, advance))
+                [0 if name == "truth" else int(plan.scripts[k][0]) for name, plan, k in every],
+                spec.seed,
+            )
+            jobs = [pool.submit(maker.clip, *clip, m, advance) for clip, m in zip(every, motions, strict=True)]
             try:
                 for job in concurrent.futures.as_completed(jobs):
                     job.result()
@@ -269,8 +272,8 @@ class _Maker:
         box = self.box(jnp.asarray(texels))
         posed = self.renderer.pose((vertices - np.asarray(box.centre)) / np.asarray(box.side))
         for view in views:
-            camera = jax.tree.map(lambda x, v=view: x[v], self.cameras)
-            exr.write_png(_image(self.folder, name, pose, view), posed.render(camera))
+            camera = jax.tree.map(lambda x, v=int(view): x[v], self.cameras)
+            exr.write_png(_image(self.folder, name, pose, int(view)), posed.render(camera))
 
 
 def matches(folder: Path, spec: DatasetSpec) -> bool:
@@ -344,7 +347,7 @@ def _image(folder: Path, name: str, pose: int, view: int) -> Path:
 
 def _pictures(folder: Path, name: str, views: np.ndarray) -> np.ndarray:
     """All pictures (p, k, h, w, 4) of a set."""
-    paths = [_image(folder, name, pose, view) for pose, row in enumerate(views) for view in row]
+    paths = [_image(folder, name, pose, int(view)) for pose, row in enumerate(views) for view in row]
     with concurrent.futures.ThreadPoolExecutor() as pool:
         pixels = np.stack(list(pool.map(exr.read_png, paths)))
     return pixels.reshape(*views.shape, *pixels.shape[1:])

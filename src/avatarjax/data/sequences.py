@@ -89,18 +89,17 @@ def simulate(
     avatar: AvatarMesh,
     scripts: Sequence[Int[np.ndarray, "_f"]],
     headings: Float[np.ndarray, " n"],
+    leads: Sequence[int],
     seed: int,
-    lead: int | None = None,
 ) -> list[Motion]:
-    """The controller's motion under each script of keys, after LEAD_IN frames under its first key, or under `lead`.
+    """The controller's motion under each script of keys, after LEAD_IN frames under the key that `leads` names.
 
     `headings` (n,) yaw in radians is where a script looks that starts idle; gait phases are drawn by `seed`. All
     scripts run in one batch, padded to one length, so that the controller is compiled once.
     """
     longest = max(len(script) for script in scripts)
     batch = np.stack([np.pad(s, (LEAD_IN, longest - len(s)), mode="edge") for s in scripts])
-    if lead is not None:
-        batch[:, :LEAD_IN] = lead
+    batch[:, :LEAD_IN] = np.asarray(leads)[:, None]
     looping = clips.load_clips(avatar.rig)
     keys = jax.random.split(jax.random.key(seed), len(batch))
     run = jax.jit(jax.vmap(lambda a, k, h: locomotion.simulate(avatar.rig, looping, a, k, heading=h)))

@@ -40,7 +40,7 @@ class Fabric:
     shear: float = 1e-4
     bend: float = 1e-2
     drag: float = 0.6
-    friction: float = 0.3
+    friction: float = 0.15
 
 
 @typing.no_type_check

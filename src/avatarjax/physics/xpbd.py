@@ -32,7 +32,7 @@ class XPBDConfig:
     """
 
     fps: float = 30.0
-    substeps: int = 20
+    substeps: int = 32
     refreshes: int = 2
     gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -42,7 +42,7 @@ class DataConfig:
     image_views: int = 50
     standing_views: int = 50
     image_size: int = 1024
-    cloth_steps: int = 20  # ours
+    cloth_steps: int = 32  # ours
     vertices: typing.Literal["none", "float16", "float32"] = "none"  # ours
 
 
@@ -148,7 +148,7 @@ def _ci() -> UnicaConfig:
             image_views=6,
             standing_views=50,
             image_size=64,
-            cloth_steps=10,
+            cloth_steps=12,
         ),
         latent=LatentConfig(
             vae=VAEConfig(channels=(16, 32, 32), residual_blocks=1, positions=32),
