@@ -16,7 +16,7 @@ FLOORS = {
 ROOM_FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 SAME_FLOOR_DOORS = {("data", "physics"), ("gaussians", "rotations"), ("cameras", "rotations"), ("io", "gaussians")}
 # Not on the GPU machines: a training or rollout step must not need them, so modules import them where they are used.
-LAZY = {"jaxopt", "trimesh", "embreex", "OpenImageIO", "tyro", "matplotlib", "av", "skimage"}
+LAZY = {"jaxopt", "trimesh", "embreex", "OpenImageIO", "tyro", "matplotlib", "av", "skimage", "grain"}
 
 
 def modules():

@@ -38,7 +38,7 @@ from avatarjax.physics.xpbd import XPBDConfig
 VERSION = 3
 VIEWS = 50  # on the cylinder (UNICA B.1)
 SPLITS = ("train", "held_out", "truth")
-_AGAIN = "build it again with --stage data"
+AGAIN = "build it again with --stage data"
 _NOTE = "building.json"  # lies beside what an unfinished build has made
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 # Simulating and rendering release the interpreter: so many clips at a time keep two cores busy.
@@ -218,7 +218,7 @@ class _Maker:
         path = folder / "avatar.safetensors"
         if path.is_file():
             arrays = weights.load_arrays(path)[0]
-            self.atlas, standing = _atlas(arrays, spec.size), arrays["standing_vertices"]
+            self.atlas, standing = atlas_of(arrays, spec.size), arrays["standing_vertices"]
         else:
             reference = dressing.settle(self.avatar, avatars.a_pose(self.avatar.rig), self.cloth)
             self.atlas = posmap.build_atlas(reference, self.avatar.faces, spec.size)
@@ -273,13 +273,13 @@ class _Maker:
         posed = self.renderer.pose((vertices - np.asarray(box.centre)) / np.asarray(box.side))
         for view in views:
             camera = jax.tree.map(lambda x, v=int(view): x[v], self.cameras)
-            exr.write_png(_image(self.folder, name, pose, int(view)), posed.render(camera))
+            exr.write_png(image_path(self.folder, name, pose, int(view)), posed.render(camera))
 
 
 def matches(folder: Path, spec: DatasetSpec) -> bool:
     """Whether `folder` has a finished dataset of exactly this spec."""
     try:
-        found = _manifest(Path(folder))
+        found = read_manifest(Path(folder))
     except ValueError:
         return False
     return found["spec"] == json.loads(json.dumps(dataclasses.asdict(spec)))
@@ -291,10 +291,10 @@ def load(folder: Path) -> Dataset:
     Raises ValueError that names what is missing, unfinished or damaged, and says how to build it again.
     """
     folder = Path(folder)
-    found = _manifest(folder)
-    manifest.check(folder, found, _AGAIN)
+    found = read_manifest(folder)
+    manifest.check(folder, found, AGAIN)
     arrays = weights.load_arrays(folder / "avatar.safetensors")[0]
-    atlas = _atlas(arrays, int(found["spec"]["size"]))
+    atlas = atlas_of(arrays, int(found["spec"]["size"]))
     takes = {name: [load_take(folder, name, k) for k in range(len(found["clips"][name]))] for name in SPLITS}
     standing = jnp.asarray(arrays["standing"])
     views = np.arange(found["spec"]["standing_views"], dtype=np.int32)[None]
@@ -316,20 +316,21 @@ def load_take(folder: Path, split: str, k: int) -> Take:
 
 def fingerprint(folder: Path) -> str:
     """A short name of the data's content, by which checkpoints know what they were trained on."""
-    return manifest.fingerprint(_manifest(Path(folder)))
+    return manifest.fingerprint(read_manifest(Path(folder)))
 
 
-def _manifest(folder: Path) -> dict[str, typing.Any]:
-    found = manifest.read(folder, VERSION, ["avatar.safetensors", "texture.png"], _AGAIN)
+def read_manifest(folder: Path) -> dict[str, typing.Any]:
+    """The manifest of a finished dataset; ValueError says what is wrong with the folder and how to mend it."""
+    found = manifest.read(folder, VERSION, ["avatar.safetensors", "texture.png"], AGAIN)
     try:
         count = {name: len(found["clips"][name]) for name in SPLITS}
         _ = int(found["spec"]["size"]), int(found["spec"]["standing_views"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{folder / manifest.NAME} is damaged ({error!r}): {_AGAIN}") from error
+        raise ValueError(f"{folder / manifest.NAME} is damaged ({error!r}): {AGAIN}") from error
     needed = [_clip(Path(), name, k).as_posix() for name in SPLITS for k in range(count[name])]
     absent = sorted(set(needed) - set(found["files"]))
     if absent:
-        raise ValueError(f"{folder / manifest.NAME} is damaged (it does not list {absent[0]}): {_AGAIN}")
+        raise ValueError(f"{folder / manifest.NAME} is damaged (it does not list {absent[0]}): {AGAIN}")
     return found
 
 
@@ -341,13 +342,14 @@ def _table(folder: Path, name: str) -> Path:
     return folder / "images" / f"{name}.safetensors"
 
 
-def _image(folder: Path, name: str, pose: int, view: int) -> Path:
+def image_path(folder: Path, name: str, pose: int, view: int) -> Path:
+    """Where a set's picture lies."""
     return folder / "images" / name / f"{pose:05d}_{view:02d}.png"
 
 
 def _pictures(folder: Path, name: str, views: np.ndarray) -> np.ndarray:
     """All pictures (p, k, h, w, 4) of a set."""
-    paths = [_image(folder, name, pose, int(view)) for pose, row in enumerate(views) for view in row]
+    paths = [image_path(folder, name, pose, int(view)) for pose, row in enumerate(views) for view in row]
     with concurrent.futures.ThreadPoolExecutor() as pool:
         pixels = np.stack(list(pool.map(exr.read_png, paths)))
     return pixels.reshape(*views.shape, *pixels.shape[1:])
@@ -358,5 +360,6 @@ def _atlas_fields() -> tuple[dataclasses.Field, ...]:
     return tuple(f for f in dataclasses.fields(posmap.Atlas) if f.name != "size")
 
 
-def _atlas(arrays: dict[str, np.ndarray], size: int) -> posmap.Atlas:
+def atlas_of(arrays: dict[str, np.ndarray], size: int) -> posmap.Atlas:
+    """The atlas among the arrays of avatar.safetensors."""
     return posmap.Atlas(**{f.name: jnp.asarray(arrays[f"atlas/{f.name}"]) for f in _atlas_fields()}, size=size)
