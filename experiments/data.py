@@ -1,0 +1,314 @@
+"""Build an avatar's training data and look at it: clothes simulated over all transitions, pictures, measured quality.
+
+    python -m experiments.data --avatar cowgirl                  # preset small: minutes on a laptop
+    python -m experiments.data --avatar monk --preset ci         # under a minute
+    python -m experiments.data --avatar all --preset paper       # UNICA's 6,253 frames an avatar, 500 poses in 8 views
+    python -m experiments.data --avatar cowgirl --performances   # films six motions for SMAD as well
+
+Results lie in OUT/data/AVATAR/PRESET/: dataset/ (read it with avatarjax.data.samples), contact_sheet.png, preview.mp4,
+quality.json, report.html and, if asked for, monocular/ (read it with avatarjax.data.load_monocular). An interrupted
+build goes on where it stopped; a finished one is reused.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from avatarjax import cameras
+from avatarjax.cameras import Camera
+from avatarjax.data import avatars, capture, cloth_quality, dataset, sequences
+from avatarjax.data.mesh_renderer import MeshRenderer
+from avatarjax.data.motion import foot_slide, performances
+from avatarjax.data.motion.locomotion import LocomotionConfig
+from avatarjax.data.wardrobe.assembly import AvatarMesh
+from avatarjax.io import atomic, exr, video, weights
+from avatarjax.metrics import responsiveness
+from avatarjax.metrics.report import Report
+from avatarjax.physics.xpbd import XPBDConfig
+
+SCRIPT = (1,) * 30 + (2,) * 30 + (3,) * 30 + (0,) * 30
+# Preset: side of the position maps, upscaled, frames of a transition and of a held-out one, poses, views, pixels,
+# steps of the cloth a frame.
+PRESETS = {
+    "ci": (32, 128, 60, 60, 24, 4, 64, 8),
+    "small": (64, 256, 150, 100, 160, 8, 256, 32),
+    "paper": (128, 1024, None, 150, 500, 8, 512, 32),
+}
+# Of the clips' frames, so many are looked at for penetration and strain.
+MEASURED = 600
+
+
+@dataclasses.dataclass
+class Args:
+    """Build and preview an avatar's data."""
+
+    avatar: str = "cowgirl"
+    """Which avatar: monk, cowgirl, survival, berserker, ghostlady, or all."""
+    preset: str = "small"
+    """Sizes: ci, small or paper."""
+    performances: bool = False
+    """Also film a slow turn and five free motions with one camera, as SMAD needs them."""
+    seed: int = 0
+    """Seed of gait phases, turning points and chosen poses."""
+    out: Path = Path("runs")
+    """Folder under which results go, as OUT/data/AVATAR/PRESET/."""
+
+
+def spec(avatar: str, preset: str, seed: int) -> dataset.DatasetSpec:
+    """What the dataset of an avatar and preset is made of. Raises ValueError for names there are not."""
+    if avatar not in avatars.names():
+        raise ValueError(f"unknown avatar {avatar!r}: choose one of {', '.join(avatars.names())}, or all")
+    if preset not in PRESETS:
+        raise ValueError(f"unknown preset {preset!r}: choose one of {', '.join(PRESETS)}")
+    size, upscaled, frames, held_out, poses, views, pixels, steps = PRESETS[preset]
+    return dataset.DatasetSpec(
+        avatar=avatar,
+        size=size,
+        upscaled=upscaled,
+        transition_frames=frames,
+        held_out_frames=held_out,
+        image_poses=poses,
+        image_views=views,
+        standing_views=dataset.VIEWS,
+        image_size=pixels,
+        script=SCRIPT,
+        seed=seed,
+        cloth_steps=steps,
+        vertices="float16",
+    )
+
+
+def make(args: Args, name: str) -> dict[str, float]:
+    """Build, measure and show one avatar's data; returns the measured numbers."""
+    wanted = spec(name, args.preset, args.seed)
+    folder = args.out / "data" / name / (args.preset if args.seed == 0 else f"{args.preset}-seed{args.seed}")
+    clock = _Clock(folder / "seconds.json")
+    if dataset.matches(folder / "dataset", wanted):
+        print(f"{name}: the dataset in {folder / 'dataset'} was finished before, reused")
+    else:
+        print(f"{name}: simulating and drawing into {folder / 'dataset'}")
+        clock.run("dataset", lambda: dataset.build(folder / "dataset", wanted))
+    avatar = avatars.build(name)
+    clips = _Clips(folder / "dataset")
+    numbers = clock.run("measuring", lambda: measure(avatar, clips, wanted))
+    size = sum(p.stat().st_size for p in (folder / "dataset").rglob("*") if p.is_file())
+    numbers |= {"dataset megabytes": size / 1e6, "dataset minutes": clock.seconds.get("dataset", 0.0) / 60}
+    clock.run("pictures", lambda: show(avatar, clips, folder))
+    films = {}
+    if args.performances:
+        for motion in performances.NAMES:
+            films[motion] = clock.run(motion, lambda m=motion: film(avatar, m, args, wanted, folder / "monocular" / m))
+    atomic.write_text(folder / "quality.json", json.dumps(numbers | {"performances": films}, indent=1))
+    write_report(folder, name, args, clips, numbers, films)
+    print(f"{name}: open {folder / 'report.html'}")
+    return numbers
+
+
+class _Clock:
+    """Runs work and keeps how long it took, over several runs of the program."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.seconds: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
+
+    def run(self, name: str, work):
+        began = time.monotonic()
+        result = work()
+        self.seconds[name] = round(time.monotonic() - began, 1)
+        atomic.write_text(self.path, json.dumps(self.seconds, indent=1))
+        return result
+
+
+class _Clips:
+    """The training clips of a dataset, vertices in the world."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.lengths = dataset.read_manifest(folder)["clips"]["train"]
+
+    def arrays(self, k: int) -> dict[str, np.ndarray]:
+        return weights.load_arrays(self.folder / "clips" / f"train-{k:03d}.safetensors")[0]
+
+    def vertices(self, k: int, frames: np.ndarray) -> np.ndarray:
+        clip = self.arrays(k)
+        return clip["vertices"][frames].astype(np.float32) + clip["roots"][frames, None]
+
+
+def measure(avatar: AvatarMesh, clips: _Clips, wanted: dataset.DatasetSpec) -> dict[str, float]:
+    """Penetration and strain of the cloth, foot slide and turning frames, over the training clips."""
+    every = max(1, sum(clips.lengths) // MEASURED)
+    depth, strain = [], []
+    for k, length in enumerate(tqdm(clips.lengths, desc="measuring", unit="clip")):
+        vertices = clips.vertices(k, np.arange(k % every, length, every))
+        depth.append(cloth_quality.penetration(avatar, vertices))
+        strain.append(cloth_quality.strain(avatar, vertices))
+    depths, strains = np.concatenate(depth), np.concatenate(strain)
+    scripts = sequences.transition_scripts(wanted.transition_frames, wanted.seed)
+    motions = sequences.simulate(avatar, scripts, np.zeros(len(scripts)), [int(s[0]) for s in scripts], wanted.seed)
+    slides = np.concatenate([foot_slide.foot_slide(avatar.rig, m.transforms[sequences.LEAD_IN :]) for m in motions])
+    turns = turning(motions, scripts)
+    return {
+        "frames": float(sum(clips.lengths)),
+        "vertices": float(len(avatar.vertices)),
+        "simulated vertices": float((avatar.reach > 0).sum()),
+        "share of vertex-frames under 5 mm deep": float((depths <= 0.005).mean()),
+        "deepest mm": 1e3 * float(depths.max()),
+        "strain 99th percentile": float(np.percentile(strains, 99)),
+        "strain median": float(np.median(strains)),
+        "foot slide median mm a step": 1e3 * float(np.median(slides)),
+        "foot slide 90th percentile mm a step": 1e3 * float(np.percentile(slides, 90)),
+        "frames of a 180 degree turn": turns[180],
+        "frames of a 90 degree turn": turns[90],
+    }
+
+
+def turning(motions, scripts) -> dict[int, float]:
+    """Median frames until the ground root's movement stays within 12 degrees of the new direction for 8 frames."""
+    yaw = LocomotionConfig().directions
+    found: dict[int, list[int]] = {180: [], 90: []}
+    for motion, script in zip(motions, scripts, strict=True):
+        source, target = int(script[0]), int(script[-1])
+        if source and target:
+            directions = responsiveness.movement_directions(np.asarray(motion.roots, np.float64)[sequences.LEAD_IN :])
+            wanted = float(yaw[target - 1])
+            angle = round(float(np.rad2deg(responsiveness.angle_between(yaw[source - 1], wanted))))
+            frames = responsiveness.turn_frames(directions, int((script == source).sum()), wanted)
+            if frames is not None:
+                found[angle].append(frames)
+    return {angle: float(np.median(frames)) for angle, frames in found.items()}
+
+
+def four_cameras(size: int) -> Camera:
+    """Four cameras around a standing figure, the first half from the front."""
+    return cameras.orbit(
+        np.arange(4) * np.pi / 2 + 0.35,
+        target=(0, 0.88, 0),
+        distance=4.6,
+        heights=0.35,
+        width=size,
+        height=size,
+        fov_y=0.46,
+    )
+
+
+def views(
+    avatar: AvatarMesh, renderer: MeshRenderer, vertices: np.ndarray, size: int, count: int = 4
+) -> list[np.ndarray]:
+    """Pictures (h, w, 3) of one frame of world vertices from the first `count` of four sides, figure in the middle."""
+    hips = avatar.weights[:, avatar.rig.index("Hips")] > 0.5
+    posed = renderer.pose((vertices - vertices[hips].mean(0) * np.array([1, 0, 1])).astype(np.float32))
+    shown = []
+    for k in range(count):
+        rgba = posed.render(jax.tree.map(lambda x, k=k: x[k], four_cameras(size))).astype(np.float32)
+        alpha = rgba[..., 3:] / 255
+        shown.append(np.round(rgba[..., :3] * alpha + 236 * (1 - alpha)).astype(np.uint8))
+    return shown
+
+
+def show(avatar: AvatarMesh, clips: _Clips, folder: Path) -> None:
+    """A contact sheet of 6 frames x 4 views, and a video of four transitions seen from the front half and the side."""
+    renderer = MeshRenderer(avatar.faces, avatar.uvs, avatar.texture)
+    # Standing; running away from the camera's side and towards it; in a half turn; in a quarter turn; stopping.
+    moments = [(0, 0.1), (0, 0.9), (5, 0.9), (5, 0.42), (6, 0.42), (4, 0.45)]
+    columns = []
+    for k, share in moments:
+        frame = np.array([int(share * clips.lengths[k])])
+        columns.append(np.concatenate(views(avatar, renderer, clips.vertices(k, frame)[0], 320), axis=0))
+    exr.write_png(folder / "contact_sheet.png", np.concatenate(columns, axis=1))
+
+    def frames():
+        for k in tqdm((0, 5, 6, 4), desc="preview", unit="clip"):
+            length = clips.lengths[k]
+            for vertices in clips.vertices(k, np.arange(max(0, length // 3 - 20), min(length, length // 3 + 50))):
+                yield np.concatenate(views(avatar, renderer, vertices, 256, 2), axis=1)
+
+    video.write_video(folder / "preview.mp4", frames())
+
+
+def film(avatar: AvatarMesh, name: str, args: Args, wanted: dataset.DatasetSpec, folder: Path) -> dict[str, float]:
+    """Film one performance, unless that was done before, and measure it."""
+    motion = jax.device_get(performances.perform(avatar.rig, name, args.seed))
+    config = XPBDConfig(substeps=wanted.cloth_steps)
+    if (folder / capture.MESHES).is_file():
+        found = weights.load_arrays(folder / capture.MESHES)[0]["vertices"].astype(np.float32)
+        vertices = found + np.asarray(motion.hips)[:, None]
+    else:
+        with tqdm(total=2 * len(motion.headings), desc=name, unit="frame") as bar:
+            size = max(128, wanted.image_size)
+            vertices = capture.film(folder, avatar, motion, size=size, config=config, progress=bar.update)
+    depth = cloth_quality.penetration(avatar, vertices[::8])
+    slides = foot_slide.foot_slide(avatar.rig, motion.transforms)
+    return {
+        "frames": float(len(vertices)),
+        "under 5 mm deep": float((depth <= 0.005).mean()),
+        "strain 99th percentile": float(np.percentile(cloth_quality.strain(avatar, vertices[::8]), 99)),
+        "foot slide median mm": 1e3 * float(np.median(slides)) if len(slides) else 0.0,
+    }
+
+
+def write_report(folder: Path, name: str, args: Args, clips: _Clips, numbers: dict, films: dict) -> None:
+    """One page with the pictures and the numbers beside their goals."""
+    report = Report(f"{name}: training data, preset {args.preset}")
+    report.code(f"python -m experiments.data --avatar {name} --preset {args.preset} --seed {args.seed}")
+    report.media(
+        folder / "contact_sheet.png", "Six moments of the training clips from four sides, drawn by ray casting"
+    )
+    report.media(folder / "preview.mp4", "Around the turning points of four transitions")
+    goals = {
+        "share of vertex-frames under 5 mm deep": (0.999, True),
+        "strain 99th percentile": (0.10, False),
+        "foot slide median mm a step": (10.0, False),
+        "frames of a 180 degree turn": (12.0, False),
+        "frames of a 90 degree turn": (9.0, False),
+        "dataset minutes": (25.0, False),
+    }
+    rows, verdicts = [], []
+    for key, value in numbers.items():
+        goal = goals.get(key)
+        rows.append((key, None if goal is None else f"{'at least' if goal[1] else 'at most'} {goal[0]:g}", value))
+        verdicts.append(None if goal is None else bool(value >= goal[0] if goal[1] else value <= goal[0]))
+    report.heading("Measured")
+    report.table(
+        f"Over {MEASURED} frames of the clips, or all motion", ("what", "goal", "measured"), rows, verdicts=verdicts
+    )
+    report.text(
+        "Depth is measured at simulated vertices and centres of cloth triangles against the skinned mesh itself. "
+        "Strain is the relative change of every edge's length, diagonals included, which woven cloth gives way in. "
+        "Foot slide is the way of the ball of a foot in one contact. A turn has ended when the movement of the ground root stays "
+        "within 12 degrees of the new direction for 8 frames."
+    )
+    if films:
+        report.heading("Performances for SMAD")
+        columns = ("performance", *next(iter(films.values())))
+        report.table("Filmed by one camera", columns, [(k, *v.values()) for k, v in films.items()])
+    report.write(folder / "report.html")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line; errors a user can mend are printed, not traced."""
+    args = tyro.cli(Args, prog="python -m experiments.data", args=argv, description=__doc__)
+    jax.config.update("jax_compilation_cache_dir", str(args.out.absolute() / ".jax_cache"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    try:
+        for name in avatars.names() if args.avatar == "all" else (args.avatar,):
+            make(args, name)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\ninterrupted: run the same command to go on", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

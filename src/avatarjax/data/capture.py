@@ -1,0 +1,94 @@
+"""Filming an avatar: what a single camera sees of a motion, with masks, cameras and poses, as SMAD takes it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy import ndimage
+
+from avatarjax import cameras, rotations
+from avatarjax.cameras import Camera
+from avatarjax.data import dressing
+from avatarjax.data.importers.monocular import Poses, write_monocular
+from avatarjax.data.mesh_renderer import MeshRenderer
+from avatarjax.data.motion.locomotion import Motion
+from avatarjax.data.wardrobe.assembly import AvatarMesh
+from avatarjax.io import weights
+from avatarjax.physics.xpbd import XPBDConfig
+
+MESHES = "meshes.safetensors"
+# Frames over which the operator smooths the path that the camera follows.
+_STEADINESS = 10.0
+_BACKGROUND = 0.93
+
+
+def following_camera(roots: Float[np.ndarray, "f 3"], size: int) -> Camera:
+    """A camera (f,) in front of a figure of up to two metres that moves along with its smoothed path (f, 3)."""
+    smooth = ndimage.gaussian_filter1d(np.asarray(roots, np.float64), _STEADINESS, axis=0, mode="nearest")
+    camera = cameras.orbit(
+        np.zeros(1), target=(0, 0.95, 0), distance=4.6, heights=0.4, width=size, height=size, fov_y=0.5
+    )
+    moved = np.tile(np.eye(4), (len(smooth), 1, 1))
+    moved[:, 0, 3], moved[:, 2, 3] = -smooth[:, 0], -smooth[:, 2]
+    world_to_camera = np.asarray(camera.world_to_camera)[0] @ moved
+    intrinsics = np.broadcast_to(np.asarray(camera.intrinsics)[0], (len(smooth), 3, 3))
+    return camera.replace(
+        world_to_camera=jnp.asarray(world_to_camera, jnp.float32), intrinsics=jnp.asarray(intrinsics, jnp.float32)
+    )
+
+
+def film(
+    folder: str | os.PathLike,
+    avatar: AvatarMesh,
+    motion: Motion,
+    *,
+    size: int = 512,
+    config: XPBDConfig = XPBDConfig(),
+    progress: Callable[[int], object] | None = None,
+) -> Float[np.ndarray, "f v 3"]:
+    """Simulate a motion, film it and write a monocular folder; returns the world vertices (f, v, 3), metres.
+
+    Beside what `load_monocular` reads, `meshes.safetensors` holds the true vertices relative to the root translation
+    as float16, faces and uvs. An older folder is replaced when all is done.
+    `progress` is called with numbers of frames that were simulated or drawn.
+    """
+    folder = Path(folder)
+    vertices = dressing.simulate(avatar, motion.transforms, config, progress=progress)
+    camera = following_camera(np.asarray(motion.roots), size)
+    renderer = MeshRenderer(avatar.faces, avatar.uvs, avatar.texture)
+    frames = []
+    for k, posed in enumerate(vertices):
+        frames.append(renderer.render(posed, jax.tree.map(lambda x, k=k: x[k], camera)))
+        if progress:
+            progress(1)
+    quats = np.array(motion.local_quats, np.float32)
+    root_rotation = np.asarray(rotations.to_matrix(jnp.asarray(quats[:, 0])))
+    quats[:, 0] = [1, 0, 0, 0]
+    poses = Poses(
+        np.asarray(rotations.to_matrix(jnp.asarray(quats))),
+        root_rotation,
+        np.asarray(motion.hips, np.float32),
+        avatar.rig.names,
+        avatar.rig.parents,
+    )
+    new = folder.with_name(f".{folder.name}.new")
+    shutil.rmtree(new, ignore_errors=True)
+    write_monocular(new, [_on_background(f) for f in frames], [f[..., 3] > 127 for f in frames], camera, poses)
+    relative = (vertices - np.asarray(motion.hips)[:, None]).astype(np.float16)
+    weights.save_tree(new / MESHES, {"vertices": relative, "faces": avatar.faces, "uvs": avatar.uvs})
+    shutil.rmtree(folder, ignore_errors=True)
+    new.rename(folder)
+    return vertices
+
+
+def _on_background(rgba: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture before a plain wall."""
+    alpha = rgba[..., 3:].astype(np.float32) / 255
+    return np.round(rgba[..., :3] * alpha + 255 * _BACKGROUND * (1 - alpha)).astype(np.uint8)
