@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from avatarjax import rotations
 from avatarjax.data.body import Rig
-from avatarjax.data.motion import clips, footlock, footsteps
+from avatarjax.data.motion import clips, foot_plans, footlock, footsteps
 from avatarjax.data.motion.locomotion import Motion
 
 FPS = 30.0
@@ -160,7 +160,7 @@ def arm_quats(rig: Rig, name: str, side: str) -> Float[np.ndarray, "2 4"]:
 
 
 @jax.jit
-def _lock(rig: Rig, quats: Array, hips: Array, plan: footsteps.Plan) -> tuple[Array, Array, Array]:
+def _lock(rig: Rig, quats: Array, hips: Array, plan: foot_plans.Plan) -> tuple[Array, Array, Array]:
     return footsteps.lock_feet(rig, quats, hips, plan)
 
 
@@ -194,25 +194,25 @@ def play(rig: Rig, score: Score) -> Motion:
     height = float(np.asarray(idle.hips)[0, 1]) - 0.012
     hips = np.stack([body[:, 0], height + body[:, 3], body[:, 1]], 1)
 
-    flat = np.asarray(footsteps.ball_heights(rig))
+    flat = np.asarray(foot_plans.ball_heights(rig))
     feet = [_foot(keys, body) for keys in (score.left, score.right)]
     balls = np.stack([place for place, *_ in feet], 1)
     balls[..., 1] += flat
-    turns = footsteps.level(
+    turns = foot_plans.level(
         jnp.asarray(np.stack([yaw for _, yaw, *_ in feet], 1), jnp.float32),
         jnp.asarray(np.stack([rise for *_, rise, _ in feet], 1), jnp.float32),
     )
     contacts = np.stack([c for *_, c in feet], 1)
     toes = np.zeros((f, 2, 4), np.float32)
     toes[..., 0] = 1
-    plan = footsteps.Plan(
+    plan = foot_plans.Plan(
         balls=jnp.asarray(balls, jnp.float32),
         balls_before=_earlier(jnp.asarray(balls, jnp.float32)),
         turns=turns,
         turns_before=_earlier(turns),
         toes=jnp.asarray(toes),
         contacts=jnp.asarray(contacts),
-        until=jnp.asarray(footsteps.frames_until(contacts, looping=False)),
+        until=jnp.asarray(foot_plans.frames_until(contacts, looping=False)),
         tolerance=jnp.full(f, jnp.inf),
         pivot_lag=jnp.zeros(f),
     )

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 
 from avatarjax import rotations
 from avatarjax.data import body, skinning
-from avatarjax.data.motion import footsteps
-from avatarjax.data.motion.footsteps import Feet
+from avatarjax.data.motion import foot_plans
+from avatarjax.data.motion.foot_plans import Feet
 from avatarjax.io import weights
 
 # Quaternion components are stored as int16 multiples of 1 / QUAT_UNIT.
@@ -42,9 +42,9 @@ class Clips:
     """The clips that locomotion blends, and run_speed: metres a second at which the running feet do not slide.
 
     start_phases (2,) are the phases of the run, in cycles, from which a standing figure sets off: one foot carries, the
-    other swings. idle_feet and run_feet say where the feet of the two clips are and when they bear weight. emotes has one clip for
-    each extra action, all padded to one length n: quats (e, n, j, 4), hips (e, n, 3), emote_feet with a leading axis e,
-    emote_frames (e,) their own lengths; None where there are no extra actions.
+    other swings. idle_feet and run_feet say where the feet of the two clips are and when they bear weight. emotes has
+    one clip for each extra action, all padded to one length n: quats (e, n, j, 4), hips (e, n, 3), emote_feet with a
+    leading axis e, emote_frames (e,) their own lengths; None where there are no extra actions.
     """
 
     idle: Clip
@@ -53,9 +53,9 @@ class Clips:
     start_phases: Float[Array, " 2"]
     idle_feet: Feet
     run_feet: Feet
-    emotes: Clip | None = None
-    emote_feet: Feet | None = None
-    emote_frames: Float[Array, " e"] | None = None
+    emotes: typing.Any = None
+    emote_feet: typing.Any = None
+    emote_frames: typing.Any = None
 
 
 def clip_names() -> tuple[str, ...]:
@@ -121,7 +121,7 @@ def ground_clip(rig: body.Rig, clip: Clip) -> Clip:
 
 def feet_of(rig: body.Rig, clip: Clip, speed: float = 0.0, looping: bool = True) -> Feet:
     """Where the feet of a clip are, and when they bear weight if the figure moves at `speed` metres a second."""
-    return footsteps.clip_feet(rig, _transforms(rig, clip), clip.quats, speed, looping)
+    return foot_plans.clip_feet(rig, _kinematics(rig, clip.quats, clip.hips)[0], clip.quats, speed, looping)
 
 
 def sample(clip: Clip, phase: Float[Array, ""]) -> tuple[Float[Array, "j 4"], Float[Array, " 3"]]:
@@ -137,9 +137,11 @@ def sample(clip: Clip, phase: Float[Array, ""]) -> tuple[Float[Array, "j 4"], Fl
 
 def sole_heights(rig: body.Rig, clip: Clip) -> tuple[Float[np.ndarray, "f 2 s"], Float[np.ndarray, "f 2 s 3"]]:
     """Heights and places of the sole points of a clip, metres."""
-    points = np.asarray(jax.vmap(lambda t: skinning.sole_points(rig, t))(_transforms(rig, clip)))
+    points = np.asarray(_kinematics(rig, clip.quats, clip.hips)[1])
     return points[..., 1], points
 
 
-def _transforms(rig: body.Rig, clip: Clip) -> Array:
-    return jax.jit(jax.vmap(lambda q, h: skinning.forward_kinematics(rig, q, h)))(clip.quats, clip.hips)
+@jax.jit
+def _kinematics(rig: body.Rig, quats: Array, hips: Array) -> tuple[Array, Array]:
+    transforms = jax.vmap(skinning.forward_kinematics, in_axes=(None, 0, 0))(rig, quats, hips)
+    return transforms, jax.vmap(skinning.sole_points, in_axes=(None, 0))(rig, transforms)

@@ -15,14 +15,14 @@ CONTACT_HEIGHT = 0.015
 _SIDES = ("Left", "Right")
 
 
-def contacts(rig: Rig, transforms: Float[Array, "f j 3 4"]) -> Bool[np.ndarray, "f 2"]:
+def contacts(rig: Rig, transforms: Float[Array | np.ndarray, "f j 3 4"]) -> Bool[np.ndarray, "f 2"]:
     """Which foot, left and right, touches the ground in each frame: the lowest point under its toes is below
     CONTACT_HEIGHT."""
     points = _soles(rig, transforms)
     return points[:, :, points.shape[2] // 2 :, 1].min(axis=2) < CONTACT_HEIGHT
 
 
-def foot_slide(rig: Rig, transforms: Float[Array, "f j 3 4"]) -> Float[np.ndarray, " n"]:
+def foot_slide(rig: Rig, transforms: Float[Array | np.ndarray, "f j 3 4"]) -> Float[np.ndarray, " n"]:
     """Horizontal path length of the ball of the foot, metres, in each of the n contacts of a motion.
 
     A contact is a maximal run of at least two frames in which one foot's lowest point under the toes is within
@@ -32,7 +32,7 @@ def foot_slide(rig: Rig, transforms: Float[Array, "f j 3 4"]) -> Float[np.ndarra
     a slide. Left contacts come first, each foot's in order of time.
     """
     touching = contacts(rig, transforms)
-    joints = np.asarray(jax.vmap(lambda t: skinning.joint_positions(rig, t))(transforms))
+    joints = np.asarray(_points(rig, jnp.asarray(transforms))[1])
     slides = []
     for side, name in enumerate(_SIDES):
         ball = joints[:, rig.index(name + "ToeBase")][:, [0, 2]]
@@ -42,10 +42,16 @@ def foot_slide(rig: Rig, transforms: Float[Array, "f j 3 4"]) -> Float[np.ndarra
     return np.array(slides, np.float32)
 
 
-def sinking(rig: Rig, transforms: Float[Array, "f j 3 4"]) -> float:
+def sinking(rig: Rig, transforms: Float[Array | np.ndarray, "f j 3 4"]) -> float:
     """The deepest that any sole point gets below the ground, metres, never negative."""
     return float(max(0.0, -_soles(rig, transforms)[..., 1].min()))
 
 
-def _soles(rig: Rig, transforms: Array) -> np.ndarray:
-    return np.asarray(jax.vmap(lambda t: skinning.sole_points(rig, t))(jnp.asarray(transforms)))
+def _soles(rig: Rig, transforms: Array | np.ndarray) -> np.ndarray:
+    return np.asarray(_points(rig, jnp.asarray(transforms))[0])
+
+
+@jax.jit
+def _points(rig: Rig, transforms: Array) -> tuple[Array, Array]:
+    soles = jax.vmap(skinning.sole_points, in_axes=(None, 0))(rig, transforms)
+    return soles, jax.vmap(skinning.joint_positions, in_axes=(None, 0))(rig, transforms)

@@ -1,12 +1,13 @@
 """Legs that reach for given feet: two-bone inverse kinematics from hip to ankle, in closed form and differentiable.
 
 The leg keeps the bending plane of the pose it starts from, carried along by the shortest arc from the old ankle
-direction to the new one. A target beyond the leg's length is approached, never reached: the knee does not snap straight.
+direction to the new one. A target beyond the leg's length is approached, never reached: no knee snaps straight.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -87,8 +88,10 @@ def two_bone(
     thigh, shank = thigh / upper[..., None], shank / lower[..., None]
     normal = _unit(jnp.cross(thigh, shank) + _HINGE_SHARE * hinge)
     before, wanted = _unit(ankle - hip), target - hip
-    distance = jnp.sqrt(jnp.sum(wanted * wanted, axis=-1) + _TINY)
-    direction = wanted / distance[..., None]
+    squared = jnp.sum(wanted * wanted, axis=-1)
+    # A target in the hip joint itself has no direction: the leg folds along the old one.
+    distance = jnp.sqrt(jnp.where(squared < 1e-6, 1e-6, squared))
+    direction = jnp.where((squared < 1e-6)[..., None], before, wanted / distance[..., None])
     reach = jnp.maximum(soft_length(distance, upper + lower), jnp.abs(upper - lower) + 0.02)
 
     swivel = jnp.broadcast_to(jnp.asarray(swivel, direction.dtype), distance.shape)
@@ -123,7 +126,7 @@ def leg_lengths(rig: Rig) -> Float[Array, " 2"]:
 
 def yaw_of(q: Float[Array, "*b 4"]) -> Float[Array, "*b"]:
     """Yaw, radians, of where a bone's +z of the rest pose points; of its +y where it points up or down."""
-    w, x, y, z = jnp.moveaxis(rotations.normalize(q), -1, 0)
+    w, _, y, _ = jnp.moveaxis(rotations.normalize(q), -1, 0)
     # The swing-twist angle about y: unlike the heading of +z it does not flip when the foot points at the ground.
     return 2 * jnp.arctan2(y, jnp.where(jnp.abs(w) + jnp.abs(y) < 1e-6, 1.0, w))
 
@@ -158,9 +161,6 @@ def place_feet(
     foot = rotations.to_matrix(feet)
     parents = transforms[np.array(rig.parents)[bones[:, 0]]][..., :3]
     chain = [parents, thigh, shank, foot]
-    local = [
-        rotations.from_matrix(_product(jnp.swapaxes(up, -1, -2), down))
-        for up, down in zip(chain[:-1], chain[1:], strict=True)
-    ]
+    local = [rotations.from_matrix(_product(jnp.swapaxes(up, -1, -2), down)) for up, down in itertools.pairwise(chain)]
     local_quats = local_quats.at[bones].set(jnp.stack([*local, toes], axis=1))
     return local_quats, skinning.forward_kinematics(rig, local_quats, hips)

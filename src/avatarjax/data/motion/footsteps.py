@@ -15,13 +15,13 @@ import typing
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from avatarjax import rotations
 from avatarjax.data import skinning
 from avatarjax.data.body import Rig
 from avatarjax.data.motion import footlock
+from avatarjax.data.motion.foot_plans import Plan, about, ball_heights, level
 from avatarjax.physics import springs
 
 _FPS = 30.0
@@ -33,6 +33,7 @@ _LEVEL_FRAMES = 3.0
 _HEEL_RISE = 1.2
 _DROP_LIMIT = 0.12
 _DROP_FREQUENCY = 22.0
+_FLAT_DROP = 0.035
 _REACH = 0.98
 _SWING_REACH = 0.995
 # How far from under its hip, metres, a foot that steps by itself comes down.
@@ -41,45 +42,6 @@ _LONGEST_STEP = 0.36
 _CLEARANCE = (0.018, 0.05)
 _OFFSET_PER_FRAME = 0.05
 _NEAR_GROUND = 0.012
-
-
-@typing.no_type_check
-@flax.struct.dataclass
-class Feet:
-    """The feet of a looping clip of n frames, left and right, relative to the figure's root, which faces +z.
-
-    balls (n, 2, 3) the toes' joints, metres; turns (n, 2, 4) rotations of the feet from rest; toes (n, 2, 4) those of
-    the toes against the feet; contacts (n, 2) whether the foot bears weight; until (n, 2) frames to its next contact.
-    """
-
-    balls: Float[Array, "n 2 3"]
-    turns: Float[Array, "n 2 4"]
-    toes: Float[Array, "n 2 4"]
-    contacts: Bool[Array, "n 2"]
-    until: Float[Array, "n 2"]
-
-
-@typing.no_type_check
-@flax.struct.dataclass
-class Plan:
-    """What the feet should do in f frames, in the world, left and right.
-
-    balls, balls_before (f, 2, 3) where the toes' joints should be in this frame and, by the same mode of movement, one
-    frame earlier, metres; turns, turns_before (f, 2, 4) likewise for the feet's rotations; toes (f, 2, 4) against the
-    feet; contacts (f, 2) whether the foot should bear weight; until (f, 2) frames to its next contact; tolerance (f,)
-    metres between a planted foot and its plan that call for a step, infinite where the plan does the stepping;
-    pivot_lag (f,) radians by which a planted foot stays behind the turn of its plan before it pivots on the ball.
-    """
-
-    balls: Float[Array, "f 2 3"]
-    balls_before: Float[Array, "f 2 3"]
-    turns: Float[Array, "f 2 4"]
-    turns_before: Float[Array, "f 2 4"]
-    toes: Float[Array, "f 2 4"]
-    contacts: Bool[Array, "f 2"]
-    until: Float[Array, "f 2"]
-    tolerance: Float[Array, " f"]
-    pivot_lag: Float[Array, " f"]
 
 
 @typing.no_type_check
@@ -108,134 +70,10 @@ class _State:
     drop_rate: Array
 
 
-def frames_until(contacts: Bool[np.ndarray, "n 2"], looping: bool = True) -> Float[np.ndarray, "n 2"]:
-    """Frames from each frame to the next one with contact, 0 in contact; n where there is none."""
-    n = len(contacts)
-    ahead = np.concatenate([contacts, contacts if looping else np.zeros_like(contacts)])
-    gaps = [np.where(ahead[i : i + n].any(0), ahead[i : i + n].argmax(0), n) for i in range(n)]
-    return np.stack(gaps).astype(np.float32)
-
-
-def clip_feet(
-    rig: Rig,
-    transforms: Float[Array, "n j 3 4"],
-    quats: Float[Array, "n j 4"],
-    speed: float = 0.0,
-    looping: bool = True,
-) -> Feet:
-    """The feet of a clip of n frames that is meant to move along +z at `speed` metres a second.
-
-    A foot comes into contact when it is both low and slow and leaves it when it is higher or faster by some margin:
-    without hysteresis a foot that lands would come loose again.
-    """
-    bones = footlock.leg_bones(rig)
-    soles = np.asarray(jax.vmap(lambda t: skinning.sole_points(rig, t))(transforms))
-    joints = np.asarray(jax.vmap(lambda t: skinning.joint_positions(rig, t))(transforms))[:, bones[:, 3]]
-    lowest = soles[:, :, soles.shape[2] // 2 :, 1].min(axis=2)
-    velocity = (np.roll(soles, -1, 0) - np.roll(soles, 1, 0)) * _FPS / 2
-    if not looping:
-        velocity[0], velocity[-1] = 0, 0
-    pace = np.linalg.norm(velocity.mean(axis=2) + np.array([0, 0, speed]), axis=-1)
-    slow = 0.3 + 0.3 * speed
-    # Some clips stand a centimetre higher on one foot than on the other.
-    lowest = lowest - np.clip(np.percentile(lowest, 10, axis=0), -0.02, 0.03)
-    enter, leave = (lowest < 0.012) & (pace < slow), (lowest > 0.028) | (pace > 1.5 * slow)
-    contacts = np.zeros(enter.shape, bool)
-    state = enter[0]
-    for _ in range(2):
-        for i in range(len(enter)):
-            state = np.where(state, ~leave[i], enter[i])
-            contacts[i] = state
-    return Feet(
-        balls=jnp.asarray(joints),
-        turns=rotations.from_matrix(transforms[:, bones[:, 2], :, :3]),
-        toes=quats[:, bones[:, 3]],
-        contacts=jnp.asarray(contacts),
-        until=jnp.asarray(frames_until(contacts, looping)),
-    )
-
-
-def sample_feet(feet: Feet, phase: Float[Array, ""]) -> Feet:
-    """The feet at a phase in cycles (any real number), with no frame axis; contacts are those of the frame before."""
-    count = feet.balls.shape[0]
-    position = (phase % 1.0) * count
-    first = jnp.floor(position).astype(jnp.int32) % count
-    weight = position - jnp.floor(position)
-    second = (first + 1) % count
-    mix = jnp.full(2, weight)
-    return Feet(
-        balls=feet.balls[first] * (1 - weight) + feet.balls[second] * weight,
-        turns=rotations.nlerp(feet.turns[first], feet.turns[second], mix),
-        toes=rotations.nlerp(feet.toes[first], feet.toes[second], mix),
-        contacts=feet.contacts[first],
-        until=jnp.maximum(feet.until[first] - weight, 0.0),
-    )
-
-
-def standing(rig: Rig, feet: Feet) -> Feet:
-    """The feet of one frame (no frame axis) put flat on the ground where they are."""
-    yaw = footlock.yaw_of(feet.turns)
-    balls = feet.balls.at[:, 1].set(ball_heights(rig))
-    still = jnp.zeros(2)
-    toes = jnp.zeros((2, 4)).at[:, 0].set(1.0)
-    return Feet(balls, level(yaw), toes, jnp.ones(2, bool), still)
-
-
-def ball_heights(rig: Rig) -> Float[Array, " 2"]:
-    """Height of the toes' joints, metres, of feet that stand flat."""
-    soles = jnp.asarray(rig.soles)
-    half = soles.shape[1] // 2
-    return jnp.asarray(rig.heads)[footlock.leg_bones(rig)[:, 3], 1] - soles[:, half:, 1].min(axis=1)
-
-
-def in_world(feet: Feet, roots: Float[Array, "f 2"], yaws: Float[Array, " f"]) -> Feet:
-    """The feet of f frames, relative to roots on the ground (x, z) with yaws in radians, as feet in the world."""
-    turn = jnp.repeat(_about(1, yaws)[:, None], 2, axis=1)
-    shift = jnp.stack([roots[:, 0], jnp.zeros(len(roots)), roots[:, 1]], axis=-1)
-    return feet.replace(
-        balls=footlock.rotate(turn, feet.balls) + shift[:, None], turns=rotations.multiply(turn, feet.turns)
-    )
-
-
-def plan(choices: typing.Any, tolerance: Float[Array, " f"], pivot_lag: Float[Array, " f"]) -> Plan:
-    """One plan from feet in the world by mode: `choices` holds (mask (f,), feet, feet one frame earlier) by mode, the
-    last that is true counts; `tolerance` and `pivot_lag` are the plan's."""
-    _, now, before = choices[0]
-    for mask, feet, feet_before in choices[1:]:
-
-        def pick(a: Array, b: Array, mask: Array = mask) -> Array:
-            return jnp.where(jnp.expand_dims(mask, tuple(range(1, a.ndim))), b, a)
-
-        now, before = jax.tree.map(pick, now, feet), jax.tree.map(pick, before, feet_before)
-    return Plan(
-        balls=now.balls,
-        balls_before=before.balls,
-        turns=now.turns,
-        turns_before=before.turns,
-        toes=now.toes,
-        contacts=now.contacts,
-        until=now.until,
-        tolerance=tolerance,
-        pivot_lag=pivot_lag,
-    )
-
-
-def _about(axis: int, angle: Array) -> Array:
-    half = angle / 2
-    parts = [jnp.cos(half), *[jnp.sin(half) if k == axis else jnp.zeros_like(half) for k in range(3)]]
-    return jnp.stack(parts, axis=-1)
-
-
-def level(yaw: Float[Array, "*b"], rise: Float[Array, "*b"] | float = 0.0) -> Float[Array, "*b 4"]:
-    """Rotation of a foot that points along `yaw`, with the heel raised by the angle `rise`, radians."""
-    rise = jnp.broadcast_to(jnp.asarray(rise, yaw.dtype), yaw.shape)
-    return rotations.multiply(_about(1, yaw), _about(0, rise))
-
-
 def _rise_of(turn: Array) -> Array:
     """How far the heel is up, radians, of a foot's rotation; negative where the toes are."""
     yaw = footlock.yaw_of(turn)
-    flat = rotations.multiply(_about(1, -yaw), turn)
+    flat = rotations.multiply(about(1, -yaw), turn)
     return 2 * jnp.arctan2(flat[..., 1], flat[..., 0])
 
 
@@ -261,7 +99,7 @@ def _stand(state: _State, turns: Array, rise: Array, weight: Array) -> Array:
     return rotations.nlerp(turns, level(state.pinned_yaw, rise), smooth)
 
 
-def _step(rig: Rig, state: _State, plan: Plan, thighs: Array) -> tuple[_State, tuple[Array, ...]]:
+def _step(rig: Rig, state: _State, plan: Plan, thighs: Array) -> tuple[_State, tuple[Array, Array, Array, Array]]:
     """One frame: `plan` without its frame axis, thighs (2, 3) the places of the hip joints before the hips sink."""
     bones = footlock.leg_bones(rig)
     heads = jnp.asarray(rig.heads)[bones]
@@ -328,13 +166,8 @@ def _step(rig: Rig, state: _State, plan: Plan, thighs: Array) -> tuple[_State, t
     ball = ball.at[:, 1].set(jnp.where(planted, ground, ball[:, 1]))
     moving = jnp.where(planted[:, None], 0.0, air_velocity)
 
-    # The hips sink, softly, where a planted leg is too short with the heel a little up.
-    aside = jnp.sum((thighs - ball)[:, ::2] ** 2, axis=-1)
-    highest = jnp.sqrt(jnp.maximum((reach + 0.1) ** 2 - aside, 0.01)) + ball[:, 1] + 0.03
-    need = jnp.max(jnp.where(planted, thighs[:, 1] - highest, 0.0))
-    drop, drop_rate = springs.critical_step(
-        state.drop, state.drop_rate, jnp.clip(need, 0.0, _DROP_LIMIT), frequency=_DROP_FREQUENCY, dt=1 / _FPS
-    )
+    need = _sinking(rig, plan, ball, pinned_yaw, planted, thighs)
+    drop, drop_rate = springs.critical_step(state.drop, state.drop_rate, need, frequency=_DROP_FREQUENCY, dt=1 / _FPS)
     # The heel rises with the plan, and further until the ankle is in reach.
     rises = jnp.linspace(0.0, _HEEL_RISE, 13)
     tried = level(jnp.repeat(pinned_yaw[:, None], 13, axis=1), jnp.repeat(rises[None], 2, axis=0))
@@ -413,7 +246,7 @@ def step_feet(
     rotations (f, 2, 4), the toes' against the feet (f, 2, 4), and by how much the hips sink (f,), metres.
     """
     first = jax.tree.map(lambda x: x[0], plan)
-    zero = jnp.zeros(2)
+    zero, yaw = jnp.zeros(2), footlock.yaw_of(first.turns)
     state = _State(
         ball=first.balls_before,
         velocity=first.balls - first.balls_before,
@@ -424,14 +257,14 @@ def step_feet(
         toes=first.toes,
         planted=first.contacts,
         armed=jnp.ones(2, bool),
-        pinned_yaw=footlock.yaw_of(first.turns),
+        pinned_yaw=yaw,
         rise=jnp.clip(_rise_of(first.turns), 0.0, _HEEL_RISE - 0.1),
         standing=first.contacts.astype(jnp.float32),
         clock=zero,
         apex=zero,
         aloft=zero,
         short=jnp.zeros(2, bool),
-        drop=jnp.zeros(()),
+        drop=_sinking(rig, first, first.balls_before, yaw, first.contacts, thighs[0]),
         drop_rate=jnp.zeros(()),
     )
     _, outputs = jax.lax.scan(lambda s, x: _step(rig, s, *x), state, (plan, thighs))

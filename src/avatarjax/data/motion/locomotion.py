@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from avatarjax import rotations
 from avatarjax.data import skinning
 from avatarjax.data.body import Rig
-from avatarjax.data.motion import footsteps
+from avatarjax.data.motion import foot_plans, footsteps
 from avatarjax.data.motion.clips import Clips, sample
 from avatarjax.physics import springs
 
@@ -306,7 +306,7 @@ def follow(
     """
     dt = 1 / config.fps
     frames = headings.shape[0]
-    rates, pushes = jnp.gradient(headings) / dt, jnp.gradient(speeds) / dt
+    rates, pushes = (jnp.asarray(jnp.gradient(x)) / dt for x in (headings, speeds))
     gaits = _gait(clips, speeds, config) * config.fps / clips.run.quats.shape[0]
     effort = jnp.minimum(speeds / clips.run_speed, 1.0)
     bank = jnp.clip(-config.lean_per_turn * rates * effort, -config.lean_limit, config.lean_limit)
@@ -341,10 +341,10 @@ def _look(rig: Rig) -> np.ndarray:
     return look
 
 
-def _plan(rig: Rig, clips: Clips, config: LocomotionConfig, states: _State) -> footsteps.Plan:
+def _plan(rig: Rig, clips: Clips, config: LocomotionConfig, states: _State) -> foot_plans.Plan:
     """Where the feet should be in every frame of `states` (leading axis f)."""
     dt = 1 / config.fps
-    home = footsteps.standing(rig, jax.tree.map(lambda x: x[0], clips.idle_feet))
+    home = foot_plans.standing(rig, jax.tree.map(lambda x: x[0], clips.idle_feet))
 
     # Running: the clip's feet, the stride as long as the speed makes it, turned a little ahead of the body.
     gait = _gait(clips, states.speed, config)
@@ -356,13 +356,13 @@ def _plan(rig: Rig, clips: Clips, config: LocomotionConfig, states: _State) -> f
     run, run_before = (
         jax.vmap(functools.partial(_warp, home, clips.run_feet))(p, stride) for p in (phases, phases - rate)
     )
-    now = footsteps.in_world(run, states.position, ahead)
-    before = footsteps.in_world(run_before, back, ahead - states.heading_rate * dt)
+    now = foot_plans.in_world(run, states.position, ahead)
+    before = foot_plans.in_world(run_before, back, ahead - states.heading_rate * dt)
 
     # Standing: where the figure will have come to rest, which the springs of speed and heading say.
     rest, facing = _resting(config, states, dt)
     homes = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(phases), *x.shape)), home)
-    stand = footsteps.in_world(homes, rest, facing)
+    stand = foot_plans.in_world(homes, rest, facing)
     stand_before = jax.tree.map(lambda x: jnp.concatenate([x[:1], x[:-1]]), stand)
     running = states.mode == 1
     tolerance = jnp.where(running, jnp.inf, config.step_tolerance)
@@ -370,7 +370,7 @@ def _plan(rig: Rig, clips: Clips, config: LocomotionConfig, states: _State) -> f
     choices = [(running, now, before), (~running, stand, stand_before)]
     if clips.emotes is not None:
         played, played_before = (
-            footsteps.in_world(
+            foot_plans.in_world(
                 jax.vmap(functools.partial(_emote_feet, clips))(states.mode, states.clock - k), rest, facing
             )
             for k in (0, 1)
@@ -378,16 +378,16 @@ def _plan(rig: Rig, clips: Clips, config: LocomotionConfig, states: _State) -> f
         choices.append((states.mode > 1, played, played_before))
         tolerance = jnp.where(states.mode > 1, config.emote_tolerance, tolerance)
     pivot_lag = jnp.where(running, config.pivot_lag, jnp.pi)
-    return footsteps.plan(choices, tolerance, pivot_lag)
+    return foot_plans.plan(choices, tolerance, pivot_lag)
 
 
 def _forward(heading: Array) -> Array:
     return jnp.stack([jnp.sin(heading), jnp.cos(heading)], axis=-1)
 
 
-def _warp(home: footsteps.Feet, feet: footsteps.Feet, phase: Array, stride: Array) -> footsteps.Feet:
+def _warp(home: foot_plans.Feet, feet: foot_plans.Feet, phase: Array, stride: Array) -> foot_plans.Feet:
     """The running feet at a phase with their strides, and the height they swing to, scaled to a slower figure."""
-    run = footsteps.sample_feet(feet, phase)
+    run = foot_plans.sample_feet(feet, phase)
     flat = home.balls[:, 1]
     lifted = flat + (run.balls[:, 1] - flat) * (0.4 + 0.6 * jnp.minimum(stride, 1.0))
     balls = jnp.stack([run.balls[:, 0], lifted, run.balls[:, 2] * stride], axis=-1)
@@ -404,7 +404,7 @@ def _resting(config: LocomotionConfig, states: _State, dt: float) -> tuple[Array
     return states.position + _forward(0.6 * states.heading + 0.4 * facing) * distance[:, None], facing
 
 
-def _emote_feet(clips: Clips, mode: Array, clock: Array) -> footsteps.Feet:
+def _emote_feet(clips: Clips, mode: Array, clock: Array) -> foot_plans.Feet:
     which, frame = _emote_frame(clips, mode, clock)
     return jax.tree.map(lambda x: x[which, frame], clips.emote_feet)
 

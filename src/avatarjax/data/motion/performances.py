@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import typing
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -106,9 +107,9 @@ def _stance(x: float, z: float, heading: float, apart: float = _APART) -> dict[s
     }
 
 
-def _stand(score: Score, frame: float, feet: dict[str, Foot], body: tuple[float, ...], arms: str) -> None:
+def _stand(score: Score, frame: float, feet: dict[str, Foot], body: Sequence[float | int], arms: str) -> None:
     """One key in every channel."""
-    score.body.append((frame, body))
+    score.body.append((frame, tuple(float(v) for v in body)))
     score.left.append((frame, feet["left"]))
     score.right.append((frame, feet["right"]))
     score.arms.append((frame, (arms, arms)))
@@ -119,10 +120,10 @@ def _spins(rig: Rig, rng: np.random.Generator) -> Motion:
     score = Score(FRAMES)
     x = z = heading = 0.0
     feet = _stance(x, z, heading)
-    _stand(score, 0, feet, (x, z, heading, -0.01, 0, 0), "low")
+    _stand(score, 0.0, feet, (x, z, heading, -0.01, 0, 0), "low")
     frame = float(rng.uniform(6, 10))
     sign = float(rng.choice([-1, 1]))
-    while frame < FRAMES - 70:
+    while frame < FRAMES - 58:
         support, free = ("left", "right") if sign > 0 else ("right", "left")
         turn = sign * 2 * np.pi
         # Wind up over both feet, weight to the ball of the one that carries.
@@ -136,11 +137,11 @@ def _spins(rig: Rig, rng: np.random.Generator) -> Motion:
         getattr(score, support).append((frame + 12, down))
         getattr(score, free).append((frame + 12, feet[free]))
         # Round on the ball: root above it, the free foot carried with the body.
-        length = round(rng.uniform(30, 36))
+        length = round(rng.uniform(28, 33))
         start, end = frame + 12, frame + 12 + length
-        up = Foot((-0.02 if support == "right" else 0.02, 0.3, 0.1), 0.35 * -sign, 0.7, down=False, with_body=True)
-        score.body.append((start + 8, (px, pz, heading + turn * 0.16, 0.02, 0, 0)))
-        score.body[-1] = (start + 6, (px, pz, heading + wind, 0.01, 0, 0))
+        side = 1.0 if free == "left" else -1.0
+        up = Foot((0.12 * side, 0.3, 0.12), 0.35 * side, 0.7, down=False, with_body=True)
+        score.body.append((start + 6, (px, pz, heading + wind, 0.01, 0, 0)))
         score.body.append((end, (px, pz, heading + turn, 0.01, 0, 0)))
         score.arms += [(start + 9, ("round", "round")), (end - 4, ("round", "round"))]
         score.left += [] if support == "left" else [(start + 9, up), (end - 3, up)]
@@ -150,16 +151,15 @@ def _spins(rig: Rig, rng: np.random.Generator) -> Motion:
         getattr(score, support).extend([(start + 6, raised), (end, spun)])
         # Down again beside it, and stand.
         heading += turn
-        side = 1.0 if free == "left" else -1.0
         x, _, z = _world((side * _APART, 0.0, -_AHEAD), px, pz, heading)
         feet = _stance(x, z, heading)
         feet[support] = Foot(down.place, down.yaw + turn)
         frame = end + 11
         _stand(score, frame, feet, (x, z, heading, -0.05, 0.04, 0), "wide")
-        frame += float(rng.uniform(12, 18))
+        frame += float(rng.uniform(8, 12))
         sign = -sign
     _stand(score, frame, feet, (x, z, heading, -0.01, 0, 0), "low")
-    _stand(score, FRAMES + 1, feet, (x, z, heading, -0.01, 0, 0), "low")
+    _stand(score, FRAMES + 1.0, feet, (x, z, heading, -0.01, 0, 0), "low")
     return choreography.play(rig, score)
 
 
@@ -167,7 +167,7 @@ def _kicks(rig: Rig, rng: np.random.Generator) -> Motion:
     """Front and side kicks from guard, left and right in turn: weight over, knee up, out, back, down."""
     score = Score(FRAMES)
     feet = _stance(0, 0, 0, 0.14)
-    _stand(score, 0, feet, (0, 0, 0, -0.05, 0.04, 0), "guard")
+    _stand(score, 0.0, feet, (0, 0, 0, -0.05, 0.04, 0), "guard")
     sides = [("left", "right", 1.0), ("right", "left", -1.0)]
     frame, count = float(rng.uniform(6, 12)), int(rng.integers(2))
     while frame < FRAMES - 52:
@@ -194,14 +194,17 @@ def _kicks(rig: Rig, rng: np.random.Generator) -> Motion:
             [(frame + 8, feet[kick]), (frame + 16, near), (frame + 22, far), (frame + 24, far), (frame + 31, near)]
         )
         getattr(score, support).append((frame + 30, feet[support]))
-        score.arms += [(frame + 16, ("guard", "guard")), (frame + 22, ("low", "guard") if sign > 0 else ("guard", "low"))]
+        score.arms += [
+            (frame + 16, ("guard", "guard")),
+            (frame + 22, ("low", "guard") if sign > 0 else ("guard", "low")),
+        ]
         score.arms.append((frame + 32, ("guard", "guard")))
         frame += 41
         _stand(score, frame, feet, (0, 0, 0, -0.06, 0.05, 0), "guard")
         frame += float(rng.uniform(3, 8))
         count += 1
     _stand(score, frame, feet, (0, 0, 0, -0.05, 0.04, 0), "guard")
-    _stand(score, FRAMES + 1, feet, (0, 0, 0, -0.05, 0.04, 0), "guard")
+    _stand(score, FRAMES + 1.0, feet, (0, 0, 0, -0.05, 0.04, 0), "guard")
     return choreography.play(rig, score)
 
 
@@ -210,7 +213,7 @@ def _jumps(rig: Rig, rng: np.random.Generator) -> Motion:
     score = Score(FRAMES)
     x = z = heading = 0.0
     feet = _stance(x, z, heading)
-    _stand(score, 0, feet, (x, z, heading, -0.01, 0, 0), "low")
+    _stand(score, 0.0, feet, (x, z, heading, -0.01, 0, 0), "low")
     frame, count = float(round(rng.uniform(5, 9))), 0
     while frame < FRAMES - 62:
         air = float(round(rng.uniform(12, 15)))
@@ -223,6 +226,8 @@ def _jumps(rig: Rig, rng: np.random.Generator) -> Motion:
         tiptoe = {side: Foot(foot.place, foot.yaw, 0.9) for side, foot in feet.items()}
         near = _world((0.0, 0.0, 0.08 * (ahead > 0.2)), x, z, heading)
         _stand(score, off, tiptoe, (near[0], near[2], heading, 0.06, 0.1, 0), "high")
+        # The arms swing up through the take-off and into the flight.
+        score.arms[-1] = (off + 5, ("high", "high"))
         x, _, z = _world((0.0, 0.0, ahead), x, z, heading)
         heading += turn
         tuck = 0.14 + air * 0.012
@@ -236,7 +241,7 @@ def _jumps(rig: Rig, rng: np.random.Generator) -> Motion:
         frame = on + 7 + float(round(rng.uniform(16, 20)))
         count += 1
     _stand(score, frame, feet, (x, z, heading, -0.01, 0, 0), "low")
-    _stand(score, FRAMES + 1, feet, (x, z, heading, -0.01, 0, 0), "low")
+    _stand(score, FRAMES + 1.0, feet, (x, z, heading, -0.01, 0, 0), "low")
     return choreography.play(rig, score)
 
 
