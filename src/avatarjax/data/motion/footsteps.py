@@ -99,6 +99,21 @@ def _stand(state: _State, turns: Array, rise: Array, weight: Array) -> Array:
     return rotations.nlerp(turns, level(state.pinned_yaw, rise), smooth)
 
 
+def _sinking(rig: Rig, plan: Plan, ball: Array, yaw: Array, planted: Array, thighs: Array) -> Array:
+    """By how much the hips should sink: where a planted leg is too short with the heel up, and a little where a
+    standing figure would have to lift its heels."""
+    heads = jnp.asarray(rig.heads)[footlock.leg_bones(rig)]
+    reach = footlock.leg_lengths(rig) * _REACH
+    aside = jnp.sum((thighs - ball)[:, ::2] ** 2, axis=-1)
+    highest = jnp.sqrt(jnp.maximum((reach + 0.1) ** 2 - aside, 0.01)) + ball[:, 1] + 0.03
+    ankle = ball + footlock.rotate(level(yaw), heads[:, 2] - heads[:, 3])
+    aside = jnp.sum((thighs - ankle)[:, ::2] ** 2, axis=-1)
+    flat = thighs[:, 1] - jnp.sqrt(jnp.maximum((reach - 0.003) ** 2 - aside, 0.01)) - ankle[:, 1]
+    flat = jnp.where(jnp.isinf(plan.tolerance), 0.0, jnp.clip(flat, 0.0, _FLAT_DROP))
+    need = jnp.clip(jnp.maximum(thighs[:, 1] - highest, flat), 0.0, _DROP_LIMIT)
+    return jnp.max(jnp.where(planted, need, 0.0))
+
+
 def _step(rig: Rig, state: _State, plan: Plan, thighs: Array) -> tuple[_State, tuple[Array, Array, Array, Array]]:
     """One frame: `plan` without its frame axis, thighs (2, 3) the places of the hip joints before the hips sink."""
     bones = footlock.leg_bones(rig)
