@@ -283,8 +283,8 @@ def write_report(folder: Path, name: str, args: Args, clips: _Clips, numbers: di
     report.text(
         "Depth is measured at simulated vertices and centres of cloth triangles against the skinned mesh itself. "
         "Strain is the relative change of every edge's length, diagonals included, which woven cloth gives way in. "
-        "Foot slide is the way of the ball of a foot in one contact. A turn has ended when the movement of the ground root stays "
-        "within 12 degrees of the new direction for 8 frames."
+        "Foot slide is the way of the ball of a foot in one contact. A turn has ended when the movement of the ground "
+        "root stays within 12 degrees of the new direction for 8 frames."
     )
     if films:
         report.heading("Performances for SMAD")

@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 
-from avatarjax.data.wardrobe import accessories, garments
 from avatarjax.data import body as bodies
+from avatarjax.data.wardrobe import accessories, garments
 
 
 @pytest.fixture(scope="module")
 def figure():
     body = bodies.load_body()
     vertices, rig = bodies.shape(body, {"caucasian-female-young": 1.0})
-    return body, vertices, rig
+    skin = np.unique(body.faces[body.parts == body.groups.index("body")])
+    return vertices[skin], body.skin_weights[skin], rig
 
 
 def test_the_triangles_of_a_tube_face_outwards():
@@ -32,10 +33,10 @@ def test_the_outline_of_a_square():
 
 
 def test_a_skirt_is_outside_the_legs_in_the_rest_pose(figure):
-    body, vertices, rig = figure
+    vertices, weights, rig = figure
     arms = [i for i, n in enumerate(rig.names) if "Arm" in n or "Hand" in n]
-    trunk = vertices[body.skin_weights[:, arms].sum(1) < 0.3]
-    piece, drape = garments.skirt(rig, trunk, top=1.0, bottom=0.5)
+    trunk = vertices[weights[:, arms].sum(1) < 0.3]
+    piece = garments.skirt(rig, trunk, top=1.0, bottom=0.5)
     centre = np.array([0, rig.heads[0, 2]])
     angle = lambda p: np.arctan2(p[:, 0] - centre[0], p[:, 2] - centre[1])  # noqa: E731
     reach = lambda p: np.hypot(p[:, 0] - centre[0], p[:, 2] - centre[1])  # noqa: E731
@@ -45,14 +46,13 @@ def test_a_skirt_is_outside_the_legs_in_the_rest_pose(figure):
         turned = np.abs((angle(cloth) - at + np.pi) % (2 * np.pi) - np.pi)
         near = np.argmin(turned * 0.3 + np.abs(cloth[:, 1] - point[1]))
         assert reach(cloth)[near] > far - 0.005
-    np.testing.assert_allclose(drape.left.sum(1), 1, atol=1e-6)
-    np.testing.assert_allclose(drape.right.sum(1), 1, atol=1e-6)
+    assert (piece.reach[:66] == 0).all() and (piece.reach[-66:] > 0.5).all()
 
 
 @pytest.mark.parametrize("side", ["Left", "Right"])
 def test_a_boot_moves_with_its_own_leg(figure, side):
-    body, vertices, rig = figure
-    boot = accessories.boot(rig, side, vertices, body.skin_weights, top=0.3)
+    vertices, weights, rig = figure
+    boot = accessories.boot(rig, side, vertices, weights, top=0.3)
     own = [i for i, n in enumerate(rig.names) if n in (f"{side}Leg", f"{side}Foot", f"{side}ToeBase")]
     assert boot.weights[:, own].sum(1).min() > 0.98
     assert boot.vertices[:, 1].min() > -0.02

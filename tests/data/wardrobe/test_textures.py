@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from avatarjax.data.wardrobe import textures
 from avatarjax.data.mesh_renderer import sample_texture
+from avatarjax.data.wardrobe import textures
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
