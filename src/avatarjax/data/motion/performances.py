@@ -166,7 +166,7 @@ def _spins(rig: Rig, rng: np.random.Generator) -> Motion:
 def _kicks(rig: Rig, rng: np.random.Generator) -> Motion:
     """Front and side kicks from guard, left and right in turn: weight over, knee up, out, back, down."""
     score = Score(FRAMES)
-    feet = _stance(0, 0, 0, 0.14)
+    feet = _stance(0.0, 0.0, 0.0, 0.14)
     _stand(score, 0.0, feet, (0, 0, 0, -0.05, 0.04, 0), "guard")
     sides = [("left", "right", 1.0), ("right", "left", -1.0)]
     frame, count = float(rng.uniform(6, 12)), int(rng.integers(2))
