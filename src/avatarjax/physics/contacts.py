@@ -80,7 +80,9 @@ def nearest(
     best, _ = jax.lax.scan(
         block, jnp.full(queries.shape[0], jnp.iinfo(jnp.int32).max & ~mask, jnp.int32), (far, other, start)
     )
-    return jnp.minimum(best & mask, count - 1)
+    # Where only the block's padding was far enough in the other pose, no point counts.
+    found = best & mask
+    return jnp.where(found < count, found, 0)
 
 
 def find_planes(positions: Float[Array, "n 3"], surface: Surface) -> Int[Array, "g n"]:
