@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from avatarjax import cameras
 from avatarjax.cameras import Camera
-from avatarjax.data import avatars, capture, cloth_quality, dataset, sequences
+from avatarjax.data import avatars, building, capture, cloth_quality, dataset, sequences
 from avatarjax.data.mesh_renderer import MeshRenderer
 from avatarjax.data.motion import foot_slide, performances
 from avatarjax.data.motion.locomotion import LocomotionConfig
@@ -96,7 +96,7 @@ def make(args: Args, name: str) -> dict[str, float]:
         print(f"{name}: the dataset in {folder / 'dataset'} was finished before, reused")
     else:
         print(f"{name}: simulating and drawing into {folder / 'dataset'}")
-        clock.run("dataset", lambda: dataset.build(folder / "dataset", wanted))
+        clock.run("dataset", lambda: building.build(folder / "dataset", wanted))
     avatar = avatars.build(name)
     clips = _Clips(folder / "dataset")
     numbers = clock.run("measuring", lambda: measure(avatar, clips, wanted))

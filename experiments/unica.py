@@ -26,7 +26,7 @@ import numpy as np
 import tyro
 
 from avatarjax import posmap, unica
-from avatarjax.data import avatars, dataset
+from avatarjax.data import MeshSequence, avatars, building, dataset, load_mesh_sequence
 from avatarjax.io import atomic, exr, ply, video
 from avatarjax.train import read_metrics
 from avatarjax.unica import files, train
@@ -43,7 +43,11 @@ class Args:
     """Train a keyboard-controlled avatar and report how well it obeys."""
 
     avatar: str = "cowgirl"
-    """Which avatar to build and train."""
+    """Which avatar to build and train: monk, cowgirl, survival, berserker or ghostlady."""
+    meshes: Path | None = None
+    """Train on your own mesh sequence instead: what avatarjax.data.load_mesh_sequence reads (docs/data_import.md)."""
+    axes: str | None = None
+    """Axes of --meshes: gltf, blender, unreal or unreal-mesh. Default: told from the first frame."""
     preset: str = ""
     """Sizes: ci, small, base or paper. Without it, small on a CPU and base on an accelerator."""
     dynamics: DynamicsName | None = None
@@ -65,6 +69,7 @@ class Experiment:
     args: Args
     config: UnicaConfig
     folder: Path
+    meshes: MeshSequence | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
     @property
@@ -88,6 +93,7 @@ class Experiment:
         data = dataclasses.asdict(self.config.data)
         return dataset.DatasetSpec(
             avatar=self.args.avatar,
+            source="" if self.meshes is None else building.describe(self.meshes),
             size=self.config.size,
             upscaled=self.config.upscaled,
             script=SCRIPT,
@@ -115,7 +121,7 @@ def run_experiment(args: Args) -> Path:
         announce("data", "finished before, reused")
     else:
         announce("data", "simulating and rendering")
-        timed(experiment, "data", lambda: dataset.build(folder / "data", experiment.spec()))
+        timed(experiment, "data", lambda: building.build(folder / "data", experiment.spec(), experiment.meshes))
     data = dataset.load(folder / "data")
     if last == 0:
         return folder
@@ -154,15 +160,21 @@ def run_experiment(args: Args) -> Path:
 
 def prepare(args: Args) -> Experiment:
     """Check the arguments and make the run's folder; ValueError says what is wrong and what there is."""
-    if args.avatar not in avatars.names():
+    meshes = None
+    if args.meshes is not None:
+        meshes = load_mesh_sequence(args.meshes, axes=args.axes)
+        args.avatar = args.meshes.stem
+    elif args.avatar not in avatars.names():
         raise ValueError(f"unknown avatar {args.avatar!r}: choose one of {', '.join(avatars.names())}")
     args.preset = args.preset or ("small" if jax.default_backend() == "cpu" else "base")
     config = unica.preset(args.preset)
     if args.dynamics:
         config = dataclasses.replace(config, dynamics=args.dynamics)
+    if meshes is not None:
+        config = dataclasses.replace(config, actions=len(meshes.action_names))
     # Another seed is another run: it must not replace the results of the first.
     name = args.preset if args.seed == 0 else f"{args.preset}-seed{args.seed}"
-    experiment = Experiment(args, config, args.out / "unica" / args.avatar / name)
+    experiment = Experiment(args, config, args.out / "unica" / args.avatar / name, meshes)
     if args.stage not in ("all", *experiment.stages()):
         raise ValueError(f"unknown stage {args.stage!r} here: choose one of all, {', '.join(experiment.stages())}")
     if not args.resume and experiment.folder.exists():

@@ -46,10 +46,10 @@ def tiny_spec():
 @pytest.fixture(scope="session")
 def tiny_folder(tiny_spec, tmp_path_factory):
     """The folder of the tiny dataset, built once: read only."""
-    from avatarjax.data import dataset
+    from avatarjax.data import building
 
     folder = tmp_path_factory.mktemp("tiny") / "data"
-    dataset.build(folder, tiny_spec, progress=False)
+    building.build(folder, tiny_spec, progress=False)
     return folder
 
 

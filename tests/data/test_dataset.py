@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from avatarjax import posmap
-from avatarjax.data import dataset
+from avatarjax.data import building, dataset
 from avatarjax.io import weights
 
 
@@ -38,7 +38,7 @@ def test_an_interrupted_build_goes_on_and_ends_alike(folder, tiny_folder, tiny_s
         (folder / "clips" / f"{name}.safetensors").unlink()
     with pytest.raises(ValueError, match="no finished dataset"):
         dataset.load(folder)
-    dataset.build(folder, tiny_spec, progress=False)
+    building.build(folder, tiny_spec, progress=False)
     assert dataset.fingerprint(folder) == dataset.fingerprint(tiny_folder)
     assert kept.stat().st_mtime_ns == before
     assert not (folder / "building.json").exists()
@@ -47,7 +47,7 @@ def test_an_interrupted_build_goes_on_and_ends_alike(folder, tiny_folder, tiny_s
 def test_what_another_spec_has_left_is_not_used(tmp_path, tiny_spec):
     (tmp_path / "clips").mkdir()
     (tmp_path / "clips" / "train-000.safetensors").write_bytes(b"other")
-    dataset._begin(tmp_path, tiny_spec)
+    building._begin(tmp_path, tiny_spec)
     assert not (tmp_path / "clips").exists()
 
 

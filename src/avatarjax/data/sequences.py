@@ -118,16 +118,22 @@ def take(
     """What one motion with LEAD_IN frames before it gives, clothes and hair simulated, and the vertices (f, v, 3)
     relative to the root of their frame, metres."""
     vertices = dressing.simulate(avatar, motion.transforms, config, progress=progress)[LEAD_IN:]
+    quats, hips = (np.asarray(a[LEAD_IN:], np.float32) for a in (motion.local_quats, motion.hips))
+    return encode(atlas, vertices, actions, quats, hips)
+
+
+def encode(
+    atlas: posmap.Atlas,
+    vertices: Float[np.ndarray, "f v 3"],
+    actions: Int[np.ndarray, " f"],
+    quats: Float[np.ndarray, "f j 4"],
+    hips: Float[np.ndarray, "f 3"],
+) -> tuple[Take, Float[np.ndarray, "f v 3"]]:
+    """The take of a sequence of world vertices (f, v, 3), and the vertices relative to the root of their frame."""
     texels = np.asarray(_encode(atlas, vertices))
     roots = np.einsum("t,ftc->fc", np.asarray(atlas.waist), texels).astype(np.float32)
-    result = Take(
-        texels=texels - roots[:, None],
-        roots=roots,
-        actions=np.asarray(actions, np.int32),
-        quats=np.asarray(motion.local_quats[LEAD_IN:], np.float32),
-        hips=np.asarray(motion.hips[LEAD_IN:], np.float32),
-    )
-    return result, vertices - roots[:, None]
+    take = Take(texels - roots[:, None], roots, np.asarray(actions, np.int32), quats, hips)
+    return take, vertices - roots[:, None]
 
 
 @jax.jit
