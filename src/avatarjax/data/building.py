@@ -116,7 +116,7 @@ class _Recorded:
         short = [k for k, run in enumerate(runs) if len(run) < 4]
         if short:
             raise ValueError(
-                f"{meshes.source}: sequence {short[0]} has {len(runs[short[0]])} frames, a group needs four"
+                f"{meshes.source}: sequence {short[0]} has {len(runs[short[0]])} frames, a group of maps needs four"
             )
         self.frames = {
             "train": [run for k, run in enumerate(runs) if k not in held],
