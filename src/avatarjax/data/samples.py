@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import os
 import typing
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
@@ -22,6 +23,7 @@ from avatarjax import posmap
 from avatarjax.data import dataset, manifest
 from avatarjax.data.mesh_renderer import MeshRenderer
 from avatarjax.io import exr, weights
+from avatarjax.posmap import groups
 
 Sample = dict[str, typing.Any]
 
@@ -198,3 +200,19 @@ def loader(source: typing.Any, *, batch: int, seed: int, epochs: int | None = 1,
 
     data = grain.MapDataset.source(source).shuffle(seed=seed)
     return data.repeat(epochs).batch(batch, drop_remainder=drop_remainder)
+
+
+def write_groups(source: GroupSource, out: str | os.PathLike, numbers: Iterable[int]) -> list[Path]:
+    """Write some groups in the layout of the public UNICA files (`posmap.groups`); returns their folders.
+
+    A folder is called SPLIT-SEQUENCE_FRAME_Action, after its third frame.
+    """
+    written = []
+    for k in numbers:
+        sample = source[k]
+        action = source.actions[int(sample["action"])].capitalize()
+        name = groups.group_name(f"{source.split}-{sample['sequence']:03d}", int(sample["frame"]), action)
+        mask = np.broadcast_to(sample["mask"], sample["posmaps"].shape[:3])
+        groups.write_group(Path(out) / name, groups.to_public(sample["posmaps"], mask))
+        written.append(Path(out) / name)
+    return written

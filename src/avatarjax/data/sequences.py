@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from avatarjax import posmap
 from avatarjax.data import dressing
+from avatarjax.data.body import Rig
 from avatarjax.data.motion import clips, locomotion
 from avatarjax.data.motion.locomotion import Motion
 from avatarjax.data.wardrobe.assembly import AvatarMesh
@@ -102,9 +103,13 @@ def simulate(
     batch[:, :LEAD_IN] = np.asarray(leads)[:, None]
     looping = clips.load_clips(avatar.rig)
     keys = jax.random.split(jax.random.key(seed), len(batch))
-    run = jax.jit(jax.vmap(lambda a, k, h: locomotion.simulate(avatar.rig, looping, a, k, heading=h)))
-    motions = jax.device_get(run(jnp.asarray(batch), keys, jnp.asarray(headings, jnp.float32)))
+    motions = jax.device_get(_run(avatar.rig, looping, jnp.asarray(batch), keys, jnp.asarray(headings, jnp.float32)))
     return [jax.tree.map(lambda x, k=k, s=s: x[k, : LEAD_IN + len(s)], motions) for k, s in enumerate(scripts)]
+
+
+@jax.jit
+def _run(rig: Rig, looping: clips.Clips, batch: Array, keys: Array, headings: Array) -> Motion:
+    return jax.vmap(lambda a, k, h: locomotion.simulate(rig, looping, a, k, heading=h))(batch, keys, headings)
 
 
 def take(
