@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import os
 import typing
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import jax
@@ -186,7 +186,7 @@ class ImageSource(_Source):
         return MeshRenderer(self.figure["faces"], self.figure["uvs"], exr.read_png(self.folder / "texture.png"))
 
     @functools.cached_property
-    def _box(self) -> typing.Callable[[np.ndarray], posmap.Box]:
+    def _box(self) -> Callable[[np.ndarray], posmap.Box]:
         upscaler = posmap.build_upscaler(self.atlas, int(self.spec["upscaled"]))
         return jax.jit(lambda texels: posmap.bounding_box(posmap.upscale(upscaler, texels)))
 

@@ -66,7 +66,8 @@ def nearest(
     other = jnp.pad(rest_points, ((0, blocks * _BLOCK - count), (0, 0))).reshape(blocks, _BLOCK, 3) if known else far
 
     def squares(a: Array, b: Array) -> Array:
-        return sum((a[None, :, k] - b[:, None, k]) ** 2 for k in range(3))
+        offset = minus(columns(a[None]), columns(b[:, None]))
+        return dot(offset, offset)
 
     def block(best: Array, inputs: tuple[Array, Array, Array]) -> tuple[Array, None]:
         own, rest, start = inputs
@@ -114,12 +115,12 @@ def push_out(
 
     def group(x: Columns, inputs: tuple[Columns, Columns, Columns]) -> tuple[Columns, None]:
         point, normal, carried = inputs
-        offset = _minus(x, point)
+        offset = minus(x, point)
         height = dot(offset, normal)
         aside = dot(offset, offset) - height * height
         held = (aside < _PLANE_RADIUS**2) & (height > -_DEEPEST)
         depth = jnp.where(held, jnp.maximum(clearance - height, 0), 0.0)
-        slip = _minus(_minus(x, previous), carried)
+        slip = minus(minus(x, previous), carried)
         slip = along(slip, -dot(slip, normal), normal)
         kept = jnp.minimum(friction * depth * jax.lax.rsqrt(dot(slip, slip) + 1e-18), 1.0)
         return along(along(x, depth, normal), -kept, slip), None
@@ -132,7 +133,7 @@ def push_out_of_capsules(x: Columns, capsules: Capsules) -> Columns:
 
     def capsule(x: Columns, inputs: Capsules) -> tuple[Columns, None]:
         begin, axis = columns(inputs.begin), columns(inputs.end - inputs.begin)
-        offset = _minus(x, begin)
+        offset = minus(x, begin)
         share = jnp.clip(dot(offset, axis) / (dot(axis, axis) + 1e-12), 0, 1)
         away = along(offset, -share, axis)
         lacking = jnp.maximum(inputs.radii * jax.lax.rsqrt(dot(away, away) + 1e-18) - 1, 0)
@@ -159,7 +160,7 @@ def keep_outside(x: Columns, inner: Int[Array, " n"], normals: Columns, gap: flo
     """Positions moved to `gap` metres outside the planes of the vertices `inner` (n,) that they are worn over, whose
     unit normals are `normals`; a vertex that is its own inner one stays."""
     normal = take(normals, inner)
-    offset = _minus(x, take(x, inner))
+    offset = minus(x, take(x, inner))
     height = dot(offset, normal)
     aside = dot(offset, offset) - height * height
     over = inner != jnp.arange(inner.shape[0], dtype=inner.dtype)
@@ -186,8 +187,8 @@ def separate(
 
     Each of the two goes half the way (each computes its own half), all of it where the other is sewn on (`free` 0).
     """
-    offset = _minus(x, take(x, neighbours))
-    apart = _minus(rest, take(rest, neighbours))
+    offset = minus(x, take(x, neighbours))
+    apart = minus(rest, take(rest, neighbours))
     inverse = jax.lax.rsqrt(dot(offset, offset) + 1e-18)
     lacking = jnp.where(dot(apart, apart) > distance**2, jnp.maximum(distance * inverse - 1, 0), 0.0)
     return along(x, lacking * free / jnp.maximum(free + free[neighbours], 1e-9), offset)
@@ -200,7 +201,7 @@ def columns(rows: Float[Array, "*s 3"]) -> Columns:
 
 def take(x: Columns, index: Int[Array, "*s"]) -> Columns:
     """Vectors by number; all numbers must be within bounds."""
-    return tuple(c.at[index].get(mode="promise_in_bounds") for c in x)
+    return jax.tree.map(lambda c: c.at[index].get(mode="promise_in_bounds"), x)
 
 
 def dot(a: Columns, b: Columns) -> Array:
@@ -210,8 +211,9 @@ def dot(a: Columns, b: Columns) -> Array:
 
 def along(x: Columns, factor: Array, direction: Columns) -> Columns:
     """x + factor direction."""
-    return tuple(c + factor * d for c, d in zip(x, direction, strict=True))
+    return jax.tree.map(lambda c, d: c + factor * d, x, direction)
 
 
-def _minus(a: Columns, b: Columns) -> Columns:
-    return tuple(c - d for c, d in zip(a, b, strict=True))
+def minus(a: Columns, b: Columns) -> Columns:
+    """a - b."""
+    return jax.tree.map(jnp.subtract, a, b)

@@ -101,7 +101,7 @@ def simulate(
 def vertex_normals(positions: Float[Array, "n 3"], faces: Array) -> Float[Array, "n 3"]:
     """Unit normals (n, 3) of a mesh, weighted by area."""
     a, b, c = (columns(positions[faces[:, k]]) for k in range(3))
-    p, q = (tuple(v - u for u, v in zip(a, other, strict=True)) for other in (b, c))
+    p, q = contacts.minus(b, a), contacts.minus(c, a)
     flat = p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
     corners = faces.T.reshape(-1)
     total = tuple(jnp.zeros(positions.shape[0]).at[corners].add(jnp.tile(f, 3)) for f in flat)
@@ -141,9 +141,9 @@ def _part(
             return jax.tree.map(lambda a, b: a + (b - a) * share, a, b)
 
         target = between(*targets)
-        velocity = tuple(v + g * dt - w for v, g, w in zip(velocity, config.gravity, config.wind, strict=True))
+        velocity = jax.tree.map(lambda v, g, w: v + g * dt - w, velocity, config.gravity, config.wind)
         velocity = _air(velocity, normals, cloth.drag, dt)
-        velocity = tuple((v + w) * slower for v, w in zip(velocity, config.wind, strict=True))
+        velocity = jax.tree.map(lambda v, w: (v + w) * slower, velocity, config.wind)
         x = _where(loose, contacts.along(before, jnp.asarray(dt), velocity), target)
         x = solve(x)
         x = _tie(x, contacts.take(x, cloth.tether), cloth.tether_length)
@@ -154,10 +154,10 @@ def _part(
         x = contacts.push_out_of_capsules(x, between(start.capsules, end.capsules))
         points, lean = between(low, high)
         inverse = jax.lax.rsqrt(contacts.dot(lean, lean) + 1e-12)
-        lean = tuple(c * inverse for c in lean)
+        lean = jax.tree.map(lambda c: c * inverse, lean)
         x = contacts.push_out(x, before, points, lean, moved, cloth.clearance, cloth.friction)
         x = _where(loose, (x[0], jnp.maximum(x[1], cloth.clearance), x[2]), target)
-        against = tuple((a - b) / dt - c for a, b, c in zip(x, before, carried, strict=True))
+        against = jax.tree.map(lambda a, b, c: (a - b) / dt - c, x, before, carried)
         speed = jax.lax.rsqrt(contacts.dot(against, against) + 1e-12)
         return (x, contacts.along(carried, jnp.minimum(1.0, config.top_speed * speed), against)), None
 
@@ -175,28 +175,30 @@ def _pair_solver(cloth: Cloth, dt: float) -> Callable[[Columns], Columns]:
 
     def colour(x: Columns, inputs: tuple[Array, Array, Array, Array]) -> tuple[Columns, None]:
         a, b, length, weight = inputs
-        offset = tuple(p - q for p, q in zip(contacts.take(x, a), contacts.take(x, b), strict=True))
+        offset = contacts.minus(contacts.take(x, a), contacts.take(x, b))
         lacking = length * jax.lax.rsqrt(contacts.dot(offset, offset) + 1e-18) - 1
         up, down = weight[:, 0] * lacking, weight[:, 1] * lacking
-        return tuple(
-            c.at[a].add(up * d, mode="promise_in_bounds").at[b].add(-down * d, mode="promise_in_bounds")
-            for c, d in zip(x, offset, strict=True)
-        ), None
+
+        def moved(c: Array, d: Array) -> Array:
+            c = c.at[a].add(up * d, mode="promise_in_bounds")
+            return c.at[b].add(-down * d, mode="promise_in_bounds")
+
+        return jax.tree.map(moved, x, offset), None
 
     def solve(x: Columns) -> Columns:
-        padded = tuple(jnp.append(c, 0.0) for c in x)
-        return tuple(c[:-1] for c in jax.lax.scan(colour, padded, inputs)[0])
+        padded = jax.tree.map(lambda c: jnp.append(c, 0.0), x)
+        return jax.tree.map(lambda c: c[:-1], jax.lax.scan(colour, padded, inputs)[0])
 
     return solve
 
 
 def _where(condition: Array, a: Columns, b: Columns) -> Columns:
-    return tuple(jnp.where(condition, p, q) for p, q in zip(a, b, strict=True))
+    return jax.tree.map(lambda p, q: jnp.where(condition, p, q), a, b)
 
 
 def _tie(x: Columns, anchor: Columns, length: Array) -> Columns:
     """Pull vertices back to at most `length` from their anchors."""
-    offset = tuple(p - q for p, q in zip(x, anchor, strict=True))
+    offset = contacts.minus(x, anchor)
     inverse = jax.lax.rsqrt(contacts.dot(offset, offset) + 1e-18)
     return contacts.along(anchor, jnp.minimum(1.0, length * inverse), offset)
 
@@ -210,4 +212,4 @@ def _air(velocity: Columns, normals: Columns, drag: Array, dt: float) -> Columns
     drag = drag * dt
     slowed = 1 / (1 + 0.1 * drag * speed)
     across = across / (1 + drag * jnp.abs(across))
-    return tuple(f * slowed + across * n for f, n in zip(flat, normals, strict=True))
+    return jax.tree.map(lambda f, n: f * slowed + across * n, flat, normals)
