@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import avatarjax as aj
 from avatarjax import cameras
 from avatarjax.data.mesh_renderer import MeshRenderer, sample_texture
 
@@ -98,3 +99,37 @@ def test_vertices_that_are_not_finite_are_refused(camera, square):
 def test_a_mesh_without_its_uvs_is_refused():
     with pytest.raises(ValueError, match="texture coordinates"):
         MeshRenderer(QUAD, QUAD_UVS[:1], checker())
+
+
+def centre_of(weight):
+    """Where the weight (h, w) of a picture lies, pixels."""
+    rows, columns = np.indices(weight.shape) + 0.5
+    return np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
+
+
+def off_centre(camera):
+    """The camera with another principal point and pixels that are not square."""
+    return camera.replace(intrinsics=camera.intrinsics.at[0, 2].add(-13.0).at[1, 2].add(7.0).at[0, 0].multiply(1.2))
+
+
+@pytest.mark.parametrize("eye", [[0.4, 0.7, 3.0], [-2.5, 0.1, 1.0], [0.5, 1.5, -2.6]])
+@pytest.mark.parametrize("change", [lambda camera: camera, off_centre], ids=["centred", "off centre"])
+def test_splats_and_meshes_are_seen_by_the_same_camera(eye, change):
+    """An octahedron and a Gaussian at the same place are within a tenth of a pixel of each other in the pictures."""
+    camera = change(cameras.look_at(eye, [0.1, 0.1, 0.0], width=112, height=72))
+    ends = 0.03 * np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
+    faces = np.array([[x, y, z] for x in (0, 3) for y in (1, 4) for z in (2, 5)])
+    renderer = MeshRenderer(faces, np.full((8, 3, 2), 0.5, np.float32), checker())
+    for place in ([0.0, 0.0, 0.0], [0.3, -0.35, 0.2], [-0.4, 0.5, -0.3]):
+        place = np.array(place, np.float32)
+        mesh = renderer.render(ends + place[None], camera, supersample=6)[..., 3].astype(np.float64)
+        gaussian = aj.Gaussians(
+            means=jnp.asarray(place)[None],
+            log_scales=jnp.full((1, 3), np.log(0.01)),
+            quats=jnp.array([[1.0, 0, 0, 0]]),
+            logit_opacities=jnp.array([4.0]),
+            colors=jnp.ones((1, 3)),
+        )
+        splat = np.asarray(aj.render(gaussian, camera).alpha, np.float64)
+        assert mesh.sum() > 255 and splat.sum() > 1
+        assert np.linalg.norm(centre_of(mesh) - centre_of(splat)) < 0.1
