@@ -8,9 +8,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from avatarjax.data.body import load_body, shape
-from avatarjax.data.wardrobe import accessories, assembly, beards, capes, makeup, patterns, tailoring
+from avatarjax.data.body import Rig, load_body, shape
+from avatarjax.data.wardrobe import assembly, capes, faces, footwear, hair, patterns, skirts, tailoring
+from avatarjax.data.wardrobe.bones import Limb, limb, share
 from avatarjax.data.wardrobe.garments import Piece, smoothstep
+from avatarjax.data.wardrobe.ground import Ground
+from avatarjax.data.wardrobe.skin import body_piece, relief
 from avatarjax.data.wardrobe.textures import mix, noise
 
 _MACRO = {"caucasian-male-young": 1.0, "universal-male-young-maxmuscle-averageweight": 2.4}
@@ -33,11 +36,10 @@ _SOLE = 0.012
 class _Cut:
     """Where leather, paint and hair are on him, metres in the rest pose."""
 
-    face: makeup.Face
+    face: faces.Face
     waist: float
     chest: np.ndarray
-    shoulder: np.ndarray
-    arm: np.ndarray
+    arm: Limb
 
     def strap(self, p: np.ndarray) -> np.ndarray:
         """Metres from the middle of the baldric, which runs from the left shoulder to the right hip and around."""
@@ -48,8 +50,8 @@ class _Cut:
 
     def harness(self, p: np.ndarray) -> np.ndarray:
         """1 on the baldric, on the trunk."""
-        trunk = (p[:, 1] > self.waist - 0.05) & (p[:, 1] < self.shoulder[1] + 0.08) & (np.abs(p[:, 0]) < 0.23)
-        arm = (p[:, 0] > self.shoulder[0] - 0.02) & (p[:, 1] < self.shoulder[1] - 0.02)
+        trunk = (p[:, 1] > self.waist - 0.05) & (p[:, 1] < self.arm.joint[1] + 0.08) & (np.abs(p[:, 0]) < 0.23)
+        arm = (p[:, 0] > self.arm.joint[0] - 0.02) & (p[:, 1] < self.arm.joint[1] - 0.02)
         return smoothstep(self.strap(p), 0.03, 0.028) * trunk * ~arm
 
     def scalp(self, p: np.ndarray) -> np.ndarray:
@@ -58,7 +60,7 @@ class _Cut:
         x = np.abs(p[:, 0])
         line = 0.066 - 0.008 * smoothstep(x, 0.03, 0.05) - 2.2 * np.clip(back - 0.036, 0, None)
         line = np.maximum(line, np.where(back < 0.1, -0.05, -0.09))
-        ear = makeup.blob((back - 0.1) / 0.028, (y + 0.012) / 0.034, 0.9) * (x > 0.068)
+        ear = faces.blob((back - 0.1) / 0.028, (y + 0.012) / 0.034, 0.9) * (x > 0.068)
         return smoothstep(y - line, -0.005, 0.005) * (1 - ear) * (y > -0.1)
 
 
@@ -67,10 +69,10 @@ def look() -> assembly.AvatarMesh:
     body = load_body()
     bare, rig = shape(body, _MACRO)
     joint = {name: rig.heads[rig.index(name)].astype(np.float64) for name in rig.names}
-    eye = assembly.body_piece(body, bare, ("helper-l-eye",), "eye").vertices
-    face = makeup.Face(
-        eye=eye.mean(0),
-        radius=float(np.ptp(eye[:, 1]) / 2),
+    eyes, eye, radius = faces.eyeballs(body, bare)
+    face = faces.Face(
+        eye=eye,
+        radius=radius,
         skin=_SKIN,
         brow=_HAIR * 0.7,
         lips=np.array([180.0, 104.0, 90.0]),
@@ -79,67 +81,62 @@ def look() -> assembly.AvatarMesh:
         lash=0.7,
         heavy=2.0,
     )
-    arm = joint["LeftForeArm"] - joint["LeftArm"]
     waist, knee = float(joint["Spine"][1]) - 0.02, float(joint["LeftLeg"][1])
     cut = _Cut(
         face=face,
         waist=waist,
         chest=np.array([0.02, 0.5 * (joint["Spine2"][1] + joint["LeftArm"][1]) - 0.03, 0.1]),
-        shoulder=joint["LeftArm"],
-        arm=arm / np.linalg.norm(arm),
+        arm=limb(rig, "Arm", "ForeArm"),
     )
     boot_top = 0.66 * knee
 
-    whole = assembly.body_piece(body, bare, ("body",), "body")
-    shell = assembly.body_piece(body, bare, ("helper-tights",), "shell")
-    skin = assembly.body_piece(body, bare, ("body",), "body", keep=bare[:, 1] > boot_top - 0.08)
-    hollow = makeup.relief(skin.vertices, skin.faces, 30)
+    whole = body_piece(body, bare, ("body",), "body")
+    shell = body_piece(body, bare, ("helper-tights",), "shell")
+    skin = body_piece(body, bare, ("body",), "body", keep=bare[:, 1] > boot_top - 0.08)
+    hollow = relief(skin.vertices, skin.faces, 30)
     skin = _thicken(skin, cut)
-    arms = tailoring.bones(rig, "Arm", "Hand")
-    trunk = skin.vertices[skin.weights[:, arms].sum(1) < 0.3]
-    eyes = assembly.body_piece(body, bare, ("helper-l-eye", "helper-r-eye"), "eyes")
+    trunk = skin.vertices[share(rig, skin.weights, "Arm", "Hand") < 0.3]
     boots = []
     for side in ("Left", "Right"):
-        boot = accessories.boot(rig, side, whole.vertices, whole.weights, top=boot_top, margin=0.014, columns=26)
+        boot = footwear.boot(rig, side, whole.vertices, whole.weights, top=boot_top, margin=0.014, columns=26)
         high = smoothstep(boot.vertices[:, 1], 0.07, 0.13)
         boots.append(capes.furry(boot, 0.016 * high, tuft=0.012))
     bracers = [_bracer(rig, shell, side) for side in (1.0, -1.0)]
     collar = capes.fur_collar(rig, shell, low=float(joint["Spine2"][1]) + 0.075)
-    kilt = capes.kilt(rig, trunk, top=waist + 0.015, bottom=knee + 0.03)
+    kilt = skirts.kilt(rig, trunk, top=waist + 0.015, bottom=knee + 0.03)
     cape = capes.cape(
-        rig, [skin, kilt], top=cut.shoulder[1] + 0.01, free=float(joint["Spine2"][1]) + 0.04, bottom=0.62 * knee
+        rig, [skin, kilt], top=cut.arm.joint[1] + 0.01, free=float(joint["Spine2"][1]) + 0.04, bottom=0.62 * knee
     )
     chin = whole.vertices[whole.weights[:, rig.index("Head")] > 0.6]
     low = chin[(np.abs(chin[:, 0]) < 0.01) & (chin[:, 1] < face.eye[1] + face.mouth - 0.02)]
     chin = low[np.argmax(low[:, 2])].astype(np.float64)
-    beard = beards.full_beard(
+    beard = hair.full_beard(
         rig,
-        tailoring.Ground.of([skin]),
+        Ground.of([skin]),
         chin,
         jaw=float(face.eye[1]) - 0.088,
         bottom=float(joint["Spine2"][1]) + 0.01,
         width=0.075,
     )
-    hair = _wild_hair(rig, cut, skin, collar, bottom=float(joint["LeftArm"][1]) - 0.01)
+    locks = _wild_hair(rig, cut, skin, collar, bottom=float(joint["LeftArm"][1]) - 0.01)
 
     layers = [
         assembly.Layer(skin, (0.0, 0.0, 0.62, 0.62), lambda p, n, uv: _paint_body(cut, hollow, p)),
-        assembly.Layer(tailoring.spread_uvs(eyes), (0.92, 0.0, 1.0, 0.08), lambda p, n, uv: makeup.paint_eyes(face, p)),
+        assembly.Layer(eyes, (0.92, 0.0, 1.0, 0.08), lambda p, n, uv: faces.paint_eyes(face, p)),
         assembly.Layer(kilt, (0.0, 0.62, 0.62, 1.0), lambda p, n, uv: _paint_kilt(p, uv)),
         assembly.Layer(cape, (0.62, 0.56, 1.0, 1.0), lambda p, n, uv: _paint_cape(p, uv)),
         assembly.Layer(collar, (0.62, 0.26, 0.92, 0.56), lambda p, n, uv: patterns.fur(p, _FUR_DARK, _FUR_LIGHT)),
-        assembly.Layer(hair, (0.62, 0.0, 0.77, 0.26), _paint_hair),
+        assembly.Layer(locks, (0.62, 0.0, 0.77, 0.26), _paint_hair),
         assembly.Layer(beard, (0.77, 0.0, 0.92, 0.26), _paint_hair),
         assembly.Layer(bracers[0], (0.92, 0.08, 1.0, 0.17), lambda p, n, uv: _paint_bracer(rig, p)),
         assembly.Layer(bracers[1], (0.92, 0.17, 1.0, 0.26), lambda p, n, uv: _paint_bracer(rig, p)),
         assembly.Layer(boots[0], (0.92, 0.26, 1.0, 0.41), _paint_boot),
         assembly.Layer(boots[1], (0.92, 0.41, 1.0, 0.56), _paint_boot),
     ]
-    soles = rig.soles - np.array([0, _SOLE, 0], np.float32)
-    return assembly.assemble("berserker", rig.replace(soles=soles), layers)
+    return assembly.assemble("berserker", rig, layers, sole=_SOLE)
 
 
-def _wild_hair(rig: capes.Rig, cut: _Cut, skin: Piece, collar: Piece, bottom: float) -> Piece:
+def _wild_hair(rig: Rig, cut: _Cut, skin: Piece, collar: Piece, bottom: float) -> Piece:
     """Two rows of locks from the sides and the back of the head down to the fur."""
     normals = assembly.vertex_normals(skin.vertices, skin.faces)
     eye = cut.face.eye
@@ -155,12 +152,12 @@ def _wild_hair(rig: capes.Rig, cut: _Cut, skin: Piece, collar: Piece, bottom: fl
             chosen.append(head[np.argmin(np.abs(away) * 0.09 + np.abs(places[:, 1] - eye[1] - height))])
     chosen = np.array(chosen)
     behind = float(collar.vertices[:, 2].min())
-    return beards.locks(
-        rig, skin.vertices[chosen], normals[chosen], tailoring.Ground.of([skin, collar]), bottom=bottom, behind=behind
+    return hair.locks(
+        rig, skin.vertices[chosen], normals[chosen], Ground.of([skin, collar]), bottom=bottom, behind=behind
     )
 
 
-def _bracer(rig: capes.Rig, shell: Piece, side: float) -> Piece:
+def _bracer(rig: Rig, shell: Piece, side: float) -> Piece:
     """A leather cuff about a forearm, from the wrist two thirds up to the elbow."""
     wrist = rig.heads[rig.index("LeftHand")].astype(np.float64) * np.array([side, 1, 1])
     elbow = rig.heads[rig.index("LeftForeArm")].astype(np.float64) * np.array([side, 1, 1])
@@ -179,20 +176,19 @@ def _bracer(rig: capes.Rig, shell: Piece, side: float) -> Piece:
 def _thicken(skin: Piece, cut: _Cut) -> Piece:
     """The skin under straps, hair and beard, which lie a little outside it."""
     p = skin.vertices.astype(np.float64)
-    scalp, beard = cut.scalp(p), makeup.beard_area(cut.face, p)
-    normals = assembly.vertex_normals(skin.vertices, skin.faces)
+    scalp, beard = cut.scalp(p), faces.beard_area(cut.face, p)
     wild = scalp * (0.02 + 0.008 * noise(p * np.array([1, 1, 0.5]), 0.02, 23))
     grown = beard * (0.012 + 0.004 * noise(p * np.array([1, 0.4, 1]), 0.012, 24))
     # Not on the ears, whose folds would turn inside out.
     back, y = cut.face.eye[2] - p[:, 2], p[:, 1] - cut.face.eye[1]
-    ear = makeup.blob((back - 0.096) / 0.045, (y + 0.016) / 0.05, 0.7) * smoothstep(np.abs(p[:, 0]), 0.058, 0.068)
+    ear = faces.blob((back - 0.096) / 0.045, (y + 0.016) / 0.05, 0.7) * smoothstep(np.abs(p[:, 0]), 0.058, 0.068)
     thick = 0.006 * cut.harness(p) + (wild + grown) * (1 - ear)
-    return dataclasses.replace(skin, vertices=(skin.vertices + normals * thick[:, None]).astype(np.float32))
+    return tailoring.let_out(skin, thick, rounds=0)
 
 
 def _paint_body(cut: _Cut, hollow: Callable[[np.ndarray], np.ndarray], p: np.ndarray) -> np.ndarray:
     face = cut.face
-    colour = makeup.paint_skin(face, p)
+    colour = faces.paint_skin(face, p)
     # Furrows between the muscles are darker and redder, their bellies catch the light; not on the face.
     below = smoothstep(p[:, 1], face.eye[1] - 0.1, face.eye[1] - 0.14)
     depth = hollow(p) * below
@@ -203,7 +199,7 @@ def _paint_body(cut: _Cut, hollow: Callable[[np.ndarray], np.ndarray], p: np.nda
     nipple = np.hypot(np.abs(p[:, 0]) - 0.098, p[:, 1] - cut.chest[1] + 0.055) * (1 + 9 * (p[:, 2] < 0.03))
     colour = mix(colour, np.array([168.0, 100, 84]), 0.8 * smoothstep(nipple, 0.012, 0.008))
     body_hair = 0.5 + 0.5 * noise(p, 0.004, 25)
-    chest = makeup.blob(p[:, 0] / 0.1, (p[:, 1] - cut.chest[1] + 0.02) / 0.09, 0.0) * (p[:, 2] > 0.04)
+    chest = faces.blob(p[:, 0] / 0.1, (p[:, 1] - cut.chest[1] + 0.02) / 0.09, 0.0) * (p[:, 2] > 0.04)
     colour = mix(colour, _HAIR * 0.8, 0.3 * chest * body_hair)
     colour = mix(colour, _WOAD, 0.85 * _war_paint(cut, p))
     leather = patterns.leather(p, _LEATHER, 26)
@@ -218,7 +214,7 @@ def _paint_body(cut: _Cut, hollow: Callable[[np.ndarray], np.ndarray], p: np.nda
     colour = mix(colour, _BRASS, (p[:, 2] > 0.03) * smoothstep(ring, 0.04, 0.037))
     colour = mix(colour, _BRASS * 0.6, (p[:, 2] > 0.03) * smoothstep(np.abs(ring - 0.024), 0.004, 0.002))
     strands = 0.16 * noise(p * np.array([1, 0.35, 1]), 0.005, 3) + 0.14 * noise(p, 0.02, 4)
-    grown = np.maximum(cut.scalp(p), makeup.beard_area(face, p))
+    grown = np.maximum(cut.scalp(p), faces.beard_area(face, p))
     return mix(colour, _HAIR * (1 + strands)[:, None], grown)
 
 
@@ -252,8 +248,8 @@ def _war_paint(cut: _Cut, p: np.ndarray) -> np.ndarray:
     breast = (x < 0.0) & (p[:, 2] > 0.03) & (np.abs(p[:, 1] - cut.chest[1]) < 0.12) & (x > -0.17)
     claw = np.abs((p[:, 1] - cut.chest[1] + 0.5 * x + ragged) % 0.04 - 0.02)
     share = np.maximum(share, breast * smoothstep(claw, 0.0095, 0.007) * (x < -0.035))
-    along = (np.stack([np.abs(x), p[:, 1], p[:, 2]], axis=1) - cut.shoulder) @ cut.arm
-    arm = (np.abs(x) > cut.shoulder[0] + 0.02) & (along > 0.1) & (along < 0.22)
+    along = cut.arm.along(p)
+    arm = (np.abs(x) > cut.arm.joint[0] + 0.02) & (along > 0.1) & (along < 0.22)
     rings = np.abs((along + ragged) % 0.04 - 0.02)
     share = np.maximum(share, arm * smoothstep(rings, 0.010, 0.0075))
     return np.clip(share * (0.85 + 0.3 * noise(p, 0.012, 28)), 0, 1)
@@ -303,11 +299,8 @@ def _paint_cape(p: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return mix(colour, patterns.fur(p, _FUR_DARK, _FUR_LIGHT), smoothstep(edge + ragged, 0.055, 0.045))
 
 
-def _paint_bracer(rig: capes.Rig, p: np.ndarray) -> np.ndarray:
-    wrist, elbow = (rig.heads[rig.index(n)].astype(np.float64) for n in ("LeftHand", "LeftForeArm"))
-    axis = (elbow - wrist) / np.linalg.norm(elbow - wrist)
-    mirrored = np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], axis=1)
-    along = (mirrored - wrist) @ axis
+def _paint_bracer(rig: Rig, p: np.ndarray) -> np.ndarray:
+    along = -limb(rig, "ForeArm", "Hand", "Hand").along(p)
     colour = patterns.leather(p, _LEATHER * 1.1, 16)
     band = np.abs((along - 0.012) % 0.056 - 0.028)
     colour = mix(colour, _STEEL, smoothstep(band, 0.010, 0.008))

@@ -7,9 +7,23 @@ import dataclasses
 
 import numpy as np
 
-from avatarjax.data.body import load_body, shape
-from avatarjax.data.wardrobe import accessories, assembly, beards, garments, makeup, patterns, props, tailoring
-from avatarjax.data.wardrobe.garments import smoothstep
+from avatarjax.data.body import Rig, load_body, shape
+from avatarjax.data.wardrobe import (
+    assembly,
+    belts,
+    bodice,
+    faces,
+    footwear,
+    hair,
+    headwear,
+    patterns,
+    skirts,
+    tailoring,
+)
+from avatarjax.data.wardrobe.bones import Limb, limb, share
+from avatarjax.data.wardrobe.garments import Piece, smoothstep
+from avatarjax.data.wardrobe.ground import Ground
+from avatarjax.data.wardrobe.skin import body_piece
 from avatarjax.data.wardrobe.textures import mix, noise
 
 _MACRO = {"caucasian-female-young": 1.0, "universal-female-young-averagemuscle-minweight": 0.25}
@@ -30,18 +44,15 @@ _SOLE = 0.012
 class _Cut:
     """Where her clothes end, metres in the rest pose: heights, and coordinates along and across the left arm."""
 
-    face: makeup.Face
-    shoulder: np.ndarray
-    arm: np.ndarray
+    face: faces.Face
+    arm: Limb
     elbow: float
     neck: float
     waist: float
 
     def sleeve(self, p: np.ndarray) -> np.ndarray:
-        """Metres from the shoulder joint along the upper arm, on the arm; a metre before it elsewhere."""
-        x = np.abs(p[:, 0])
-        along = (np.stack([x, p[:, 1], p[:, 2]], axis=1) - self.shoulder) @ self.arm
-        return np.where(x > self.shoulder[0] - 0.01 + 0.35 * np.clip(self.shoulder[1] - p[:, 1], 0, None), along, -1.0)
+        """Metres from the shoulder joint along the upper arm, on the arm; minus one elsewhere."""
+        return bodice.down_the_arm(self.arm, p)
 
     def collar(self, p: np.ndarray) -> np.ndarray:
         """Metres above the neckline, which is lower in front than behind and runs over the shoulders."""
@@ -56,7 +67,7 @@ class _Cut:
 
     def vest(self, p: np.ndarray) -> np.ndarray:
         """1 where the vest lies over the shirt: not on the arms, and open in a V at the front."""
-        x, low = np.abs(p[:, 0]) - self.shoulder[0], self.shoulder[1] - p[:, 1]
+        x, low = np.abs(p[:, 0]) - self.arm.joint[0], self.arm.joint[1] - p[:, 1]
         # The armhole is a straight line over the shoulder and round under the arm.
         armhole = np.minimum(x + 0.035, 0.065 - np.hypot(np.minimum(x - 0.03, 0), np.clip(low - 0.02, 0, None)))
         opening = 0.022 + 0.30 * np.clip(p[:, 1] - self.waist - 0.1, 0, None)
@@ -77,7 +88,7 @@ class _Cut:
         y, back = p[:, 1] - self.face.eye[1], self.face.eye[2] - p[:, 2]
         line = 0.062 - 1.1 * np.clip(back - 0.022, 0, None)
         line = np.maximum(line, -0.085)
-        ear = makeup.blob((back - 0.088) / 0.03, (y + 0.02) / 0.035, 0.9) * (np.abs(p[:, 0]) > 0.06)
+        ear = faces.blob((back - 0.088) / 0.03, (y + 0.02) / 0.035, 0.9) * (np.abs(p[:, 0]) > 0.06)
         return smoothstep(y - line, -0.006, 0.006) * (1 - ear) * (y > -0.11)
 
 
@@ -86,39 +97,35 @@ def look() -> assembly.AvatarMesh:
     body = load_body()
     bare, rig = shape(body, _MACRO)
     joint = {name: rig.heads[rig.index(name)].astype(np.float64) for name in rig.names}
-    eye = assembly.body_piece(body, bare, ("helper-l-eye",), "eye").vertices
-    face = makeup.Face(
-        eye=eye.mean(0),
-        radius=float(np.ptp(eye[:, 1]) / 2),
+    eyes, eye, radius = faces.eyeballs(body, bare)
+    face = faces.Face(
+        eye=eye,
+        radius=radius,
         skin=np.array([236.0, 190.0, 160.0]),
         brow=_HAIR * 0.5,
         lips=np.array([186.0, 84.0, 82.0]),
         iris=np.array([74.0, 122.0, 110.0]),
     )
-    arm = joint["LeftForeArm"] - joint["LeftArm"]
     cut = _Cut(
         face=face,
-        shoulder=joint["LeftArm"],
-        arm=arm / np.linalg.norm(arm),
-        elbow=float(np.linalg.norm(arm)),
+        arm=limb(rig, "Arm", "ForeArm"),
+        elbow=float(np.linalg.norm(joint["LeftForeArm"] - joint["LeftArm"])),
         neck=float(joint["Neck"][1]),
         waist=float(joint["Spine"][1]) + 0.025,
     )
     knee = float(joint["LeftLeg"][1])
     boot_top = 0.72 * knee
 
-    whole = assembly.body_piece(body, bare, ("body",), "body")
-    skin = assembly.body_piece(body, bare, ("body",), "body", keep=bare[:, 1] > boot_top - 0.03)
+    whole = body_piece(body, bare, ("body",), "body")
+    skin = body_piece(body, bare, ("body",), "body", keep=bare[:, 1] > boot_top - 0.03)
     skin = _thicken(skin, cut)
-    eyes = assembly.body_piece(body, bare, ("helper-l-eye", "helper-r-eye"), "eyes")
     head = skin.vertices[skin.weights[:, rig.index("Head")] > 0.6]
-    boots = [accessories.boot(rig, s, whole.vertices, whole.weights, top=boot_top) for s in ("Left", "Right")]
-    hat = accessories.hat(rig, head, base=float(face.eye[1]) + 0.058)
+    boots = [footwear.boot(rig, s, whole.vertices, whole.weights, top=boot_top) for s in ("Left", "Right")]
+    hat = headwear.hat(rig, head, base=float(face.eye[1]) + 0.058)
     braids = _braids(rig, skin, face, bottom=float(joint["Spine2"][1]) - 0.1)
-    arms = [rig.index(n) for n in rig.names if "Arm" in n or "Hand" in n or "Shoulder" in n]
-    trunk = skin.vertices[skin.weights[:, arms].sum(1) < 0.3]
-    skirt = garments.skirt(rig, trunk, top=cut.waist, bottom=knee + 0.02, flare=0.3)
-    belt = props.bullet_belt(rig, skirt.vertices, left=cut.waist - 0.045, right=cut.waist - 0.1)
+    trunk = skin.vertices[share(rig, skin.weights, "Arm", "Hand", "Shoulder") < 0.3]
+    skirt = skirts.skirt(rig, trunk, top=cut.waist, bottom=knee + 0.02, flare=0.3)
+    belt = belts.bullet_belt(rig, skirt.vertices, left=cut.waist - 0.045, right=cut.waist - 0.1)
     # Where the belt lies on the skirt, it holds it.
     loose = 1.5 * np.clip(belt.vertices[:, 1].min() - 0.012 - skirt.vertices[:, 1], 0, None)
     skirt = dataclasses.replace(skirt, reach=loose.astype(np.float32))
@@ -128,32 +135,27 @@ def look() -> assembly.AvatarMesh:
         assembly.Layer(braids[0], (0.74, 0.0, 0.82, 0.36), _paint_braid),
         assembly.Layer(braids[1], (0.82, 0.0, 0.9, 0.36), _paint_braid),
         assembly.Layer(belt, (0.88, 0.86, 1.0, 1.0), _paint_bullet_belt),
-        assembly.Layer(
-            tailoring.spread_uvs(eyes), (0.88, 0.74, 1.0, 0.86), lambda p, n, uv: makeup.paint_eyes(face, p)
-        ),
+        assembly.Layer(eyes, (0.88, 0.74, 1.0, 0.86), lambda p, n, uv: faces.paint_eyes(face, p)),
         assembly.Layer(hat, (0.74, 0.36, 1.0, 0.74), _paint_hat),
         assembly.Layer(boots[0], (0.6, 0.74, 0.74, 1.0), _paint_boot),
         assembly.Layer(boots[1], (0.74, 0.74, 0.88, 1.0), _paint_boot),
         assembly.Layer(skirt, (0.0, 0.74, 0.6, 1.0), _paint_skirt),
     ]
-    soles = rig.soles - np.array([0, _SOLE, 0], np.float32)
-    return assembly.assemble("cowgirl", rig.replace(soles=soles), layers)
+    return assembly.assemble("cowgirl", rig, layers, sole=_SOLE)
 
 
-def _thicken(skin: garments.Piece, cut: _Cut) -> garments.Piece:
+def _thicken(skin: Piece, cut: _Cut) -> Piece:
     """The skin as a garment where she is dressed: smoother than a body, and a little outside it; fuller under the
     hair."""
     p = skin.vertices.astype(np.float64)
     dressed, scalp = cut.torso(p), cut.scalp(p)
-    smooth = assembly.relax(skin.vertices, skin.faces, (0.6 * dressed + 0.3 * scalp).astype(np.float32), 12)
-    normals = assembly.vertex_normals(smooth, skin.faces)
     thick = 0.006 * dressed + 0.005 * cut.vest(p) + 0.008 * cut.bandana(p) + 0.014 * scalp
-    return dataclasses.replace(skin, vertices=(smooth + normals * thick[:, None]).astype(np.float32))
+    return tailoring.let_out(skin, thick, 0.6 * dressed + 0.3 * scalp, 12)
 
 
-def _braids(rig: garments.Rig, skin: garments.Piece, face: makeup.Face, bottom: float) -> list[garments.Piece]:
+def _braids(rig: Rig, skin: Piece, face: faces.Face, bottom: float) -> list[Piece]:
     """Two braids from behind the ears over the front of the shoulders down to about height `bottom`."""
-    ground = tailoring.Ground.of([skin])
+    ground = Ground.of([skin])
     eye = face.eye
     neck = rig.heads[rig.index("Neck")]
     braids = []
@@ -168,12 +170,12 @@ def _braids(rig: garments.Rig, skin: garments.Piece, face: makeup.Face, bottom: 
                 [0.08, bottom, neck[2] + 0.15],
             ]
         )
-        braids.append(beards.braid(rig, name, knots * np.array([side, 1, 1]), ground, width=0.023))
+        braids.append(hair.braid(rig, name, knots * np.array([side, 1, 1]), ground, width=0.023))
     return braids
 
 
 def _paint_body(cut: _Cut, p: np.ndarray) -> np.ndarray:
-    colour = makeup.paint_skin(cut.face, p)
+    colour = faces.paint_skin(cut.face, p)
     strands = noise(p * np.array([1, 0.25, 1]), 0.004, 3)
     colour = mix(colour, _HAIR * (0.9 + 0.16 * strands)[:, None], cut.scalp(p))
     shirt = np.broadcast_to(_SHIRT, p.shape) * (1 + 0.03 * noise(p, 0.012, 1))[:, None]
@@ -220,7 +222,7 @@ def _paint_skirt(p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def _paint_braid(p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    return beards.paint_braid(uv, _HAIR, _BANDANA)
+    return hair.paint_braid(uv, _HAIR, _BANDANA)
 
 
 def _paint_bullet_belt(p: np.ndarray, n: np.ndarray, uv: np.ndarray) -> np.ndarray:

@@ -6,9 +6,11 @@ import dataclasses
 
 import numpy as np
 
-from avatarjax.data.body import load_body, shape
-from avatarjax.data.wardrobe import accessories, assembly, coats, makeup, patterns, props, tailoring
+from avatarjax.data.body import Rig, load_body, shape
+from avatarjax.data.wardrobe import assembly, backpacks, coats, faces, footwear, patterns, skirts, tailoring
+from avatarjax.data.wardrobe.bones import Limb, limb, share
 from avatarjax.data.wardrobe.garments import Piece, smoothstep
+from avatarjax.data.wardrobe.skin import body_piece
 from avatarjax.data.wardrobe.textures import mix, noise
 
 _MACRO = {
@@ -34,19 +36,17 @@ _SOLE = 0.012
 class _Cut:
     """Where his clothes end, metres in the rest pose."""
 
-    face: makeup.Face
+    face: faces.Face
     waist: float
     neck: float
     hip: float
     knee: float
-    wrist: np.ndarray
-    forearm: np.ndarray
+    wrist: Limb
     legs: tuple[np.ndarray, np.ndarray]
 
     def hand(self, p: np.ndarray) -> np.ndarray:
         """Metres past the wrist along the forearm; negative before it and off the arms."""
-        mirrored = np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], axis=1)
-        return (mirrored - self.wrist) @ self.forearm
+        return self.wrist.along(p)
 
     def on_arm(self, p: np.ndarray) -> np.ndarray:
         """Whether a point is of the forearm or the hand: no other part is as far out."""
@@ -88,7 +88,7 @@ class _Cut:
         line = 0.066 - 0.01 * smoothstep(x, 0.025, 0.045) - 2.4 * np.clip(back - 0.034, 0, None)
         # The sideburn runs down before the ear.
         line = np.maximum(line, np.where(back < 0.095, -0.012, -0.075))
-        ear = makeup.blob((back - 0.098) / 0.03, (y + 0.012) / 0.036, 0.9) * (x > 0.068)
+        ear = faces.blob((back - 0.098) / 0.03, (y + 0.012) / 0.036, 0.9) * (x > 0.068)
         return smoothstep(y - line, -0.005, 0.005) * (1 - ear) * (y > -0.1)
 
     def glove(self, p: np.ndarray) -> np.ndarray:
@@ -102,10 +102,10 @@ def look() -> assembly.AvatarMesh:
     body = load_body()
     bare, rig = shape(body, _MACRO)
     joint = {name: rig.heads[rig.index(name)].astype(np.float64) for name in rig.names}
-    eye = assembly.body_piece(body, bare, ("helper-l-eye",), "eye").vertices
-    face = makeup.Face(
-        eye=eye.mean(0),
-        radius=float(np.ptp(eye[:, 1]) / 2),
+    eyes, eye, radius = faces.eyeballs(body, bare)
+    face = faces.Face(
+        eye=eye,
+        radius=radius,
         skin=np.array([226.0, 178.0, 146.0]),
         brow=_HAIR * 0.75,
         lips=np.array([186.0, 116.0, 100.0]),
@@ -114,40 +114,36 @@ def look() -> assembly.AvatarMesh:
         lash=0.6,
         heavy=1.6,
     )
-    forearm = joint["LeftHand"] - joint["LeftForeArm"]
     cut = _Cut(
         face=face,
         waist=float(joint["Spine"][1]) - 0.03,
         neck=float(joint["Neck"][1]),
         hip=float(joint["LeftUpLeg"][1]),
         knee=float(joint["LeftLeg"][1]),
-        wrist=joint["LeftHand"],
-        forearm=forearm / np.linalg.norm(forearm),
+        wrist=limb(rig, "ForeArm", "Hand", "Hand"),
         legs=(joint["LeftUpLeg"], joint["LeftLeg"]),
     )
     boot_top = 0.58 * cut.knee
 
-    whole = assembly.body_piece(body, bare, ("body",), "body")
-    shell = assembly.body_piece(body, bare, ("helper-tights",), "coat")
-    skin = _thicken(assembly.body_piece(body, bare, ("body",), "body", keep=_seen(cut, bare, boot_top)), cut)
-    eyes = assembly.body_piece(body, bare, ("helper-l-eye", "helper-r-eye"), "eyes")
+    whole = body_piece(body, bare, ("body",), "body")
+    shell = body_piece(body, bare, ("helper-tights",), "coat")
+    skin = _thicken(body_piece(body, bare, ("body",), "body", keep=_seen(cut, bare, boot_top)), cut)
     boots = [
-        accessories.boot(rig, s, whole.vertices, whole.weights, top=boot_top, margin=0.012) for s in ("Left", "Right")
+        footwear.boot(rig, s, whole.vertices, whole.weights, top=boot_top, margin=0.012) for s in ("Left", "Right")
     ]
     top = coats.coat_top(rig, shell, waist=cut.waist - 0.01, neck=cut.neck - 0.02)
-    arms = tailoring.bones(rig, "Arm", "Hand")
-    trunk = top.vertices[top.weights[:, arms].sum(1) < 0.3]
-    legs = skin.vertices[skin.weights[:, arms].sum(1) < 0.3]
+    trunk = top.vertices[share(rig, top.weights, "Arm", "Hand") < 0.3]
+    legs = skin.vertices[share(rig, skin.weights, "Arm", "Hand") < 0.3]
     under = np.concatenate([trunk, legs[legs[:, 1] < cut.waist + 0.03]])
-    skirt = coats.coat_skirt(rig, under, top, start=cut.waist + 0.025, waist=cut.waist - 0.015, bottom=0.62 * cut.knee)
+    skirt = skirts.coat_skirt(rig, under, top, start=cut.waist + 0.025, waist=cut.waist - 0.015, bottom=0.62 * cut.knee)
     collar = coats.collar(rig, whole.vertices, top, base=cut.neck - 0.012)
     back = float(trunk[np.abs(trunk[:, 1] - joint["Spine2"][1]) < 0.12, 2].min())
     centre = np.array([0.0, float(joint["Spine2"][1]) - 0.035, back - 0.09])
-    pack = props.backpack(rig, top, centre=centre)
+    pack = backpacks.backpack(rig, top, centre=centre)
 
     layers = [
         assembly.Layer(skin, (0.0, 0.0, 0.6, 0.6), lambda p, n, uv: _paint_body(cut, p)),
-        assembly.Layer(tailoring.spread_uvs(eyes), (0.9, 0.6, 1.0, 0.7), lambda p, n, uv: makeup.paint_eyes(face, p)),
+        assembly.Layer(eyes, (0.9, 0.6, 1.0, 0.7), lambda p, n, uv: faces.paint_eyes(face, p)),
         assembly.Layer(top, (0.6, 0.0, 1.0, 0.6), lambda p, n, uv: _paint_coat(cut, rig, p)),
         assembly.Layer(collar, (0.6, 0.6, 0.9, 0.7), lambda p, n, uv: _paint_collar(p, uv)),
         assembly.Layer(skirt, (0.0, 0.6, 0.4, 1.0), lambda p, n, uv: _paint_coat_skirt(p, uv)),
@@ -155,8 +151,7 @@ def look() -> assembly.AvatarMesh:
         assembly.Layer(boots[0], (0.78, 0.7, 0.89, 1.0), _paint_boot),
         assembly.Layer(boots[1], (0.89, 0.7, 1.0, 1.0), _paint_boot),
     ]
-    soles = rig.soles - np.array([0, _SOLE, 0], np.float32)
-    return assembly.assemble("survival", rig.replace(soles=soles), layers)
+    return assembly.assemble("survival", rig, layers, sole=_SOLE)
 
 
 def _seen(cut: _Cut, p: np.ndarray, boot_top: float) -> np.ndarray:
@@ -172,8 +167,6 @@ def _thicken(skin: Piece, cut: _Cut) -> Piece:
     """The skin as his clothes where he is dressed, and fuller under the hair."""
     p = skin.vertices.astype(np.float64)
     dressed, scalp, trousers = cut.dressed(p), cut.scalp(p), cut.trousers(p)
-    smooth = assembly.relax(skin.vertices, skin.faces, (0.6 * dressed + 0.2 * scalp).astype(np.float32), 10)
-    normals = assembly.vertex_normals(smooth, skin.faces)
     pocket = smoothstep(cut.pocket(p), 1.05, 0.9) * trousers
     # Trousers are wider below the knee, where they bag over the boots, and crumple there.
     bag = smoothstep(p[:, 1], cut.knee + 0.1, 0.6 * cut.knee)
@@ -184,12 +177,12 @@ def _thicken(skin: Piece, cut: _Cut) -> Piece:
     cloth = np.where(trousers > 0.5, legs, cloth)
     hair = scalp * (0.011 + 0.004 * noise(p, 0.016, 23))
     thick = cloth + hair + 0.002 * cut.glove(p)
-    return dataclasses.replace(skin, vertices=(smooth + normals * thick[:, None]).astype(np.float32))
+    return tailoring.let_out(skin, thick, 0.6 * dressed + 0.2 * scalp, 10)
 
 
 def _paint_body(cut: _Cut, p: np.ndarray) -> np.ndarray:
     face = cut.face
-    colour = makeup.paint_stubble(face, makeup.paint_skin(face, p), p, 0.42)
+    colour = faces.paint_stubble(face, faces.paint_skin(face, p), p, 0.42)
     strands = 0.14 * noise(p * np.array([1, 1, 0.3]), 0.004, 3) + 0.16 * noise(p, 0.012, 4)
     colour = mix(colour, _HAIR * (1 + strands)[:, None], cut.scalp(p))
     shirt = _SHIRT * (1 + 0.03 * noise(p, 0.01, 1))[:, None]
@@ -240,7 +233,7 @@ def _trousers(cut: _Cut, p: np.ndarray) -> np.ndarray:
     return mix(colour, _TROUSERS * 0.6, 0.8 * fly)
 
 
-def _paint_coat(cut: _Cut, rig: coats.Rig, p: np.ndarray) -> np.ndarray:
+def _paint_coat(cut: _Cut, rig: Rig, p: np.ndarray) -> np.ndarray:
     colour = patterns.leather(p, _COAT, 29)
     x = np.abs(p[:, 0])
     edge = 0.085

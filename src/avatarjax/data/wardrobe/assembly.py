@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy import sparse
 
-from avatarjax.data.body import Body, Rig
+from avatarjax.data.body import Rig
 from avatarjax.data.wardrobe import textures
 from avatarjax.data.wardrobe.garments import Piece
 from avatarjax.physics.cloth import Fabric
@@ -47,26 +47,6 @@ class AvatarMesh:
     rig: Rig
 
 
-def body_piece(
-    body: Body, vertices: Float[np.ndarray, "v 3"], groups: tuple[str, ...], name: str, keep: np.ndarray | None = None
-) -> Piece:
-    """Some groups of the shaped body as triangles; `keep` (v,) bool drops every face that has a vertex not kept."""
-    chosen = np.isin(body.parts, [body.groups.index(g) for g in groups])
-    if keep is not None:
-        chosen &= keep[body.faces].all(axis=1)
-    quads, corners = body.faces[chosen], body.uvs[body.uv_faces[chosen]]
-    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    uvs = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
-    used, faces = np.unique(triangles, return_inverse=True)
-    return Piece(
-        name,
-        vertices[used].astype(np.float32),
-        faces.reshape(-1, 3).astype(np.int32),
-        uvs,
-        body.skin_weights[used],
-    )
-
-
 def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
     """Unit normals (v, 3): area-weighted means of the triangles around each vertex."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -75,14 +55,18 @@ def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     return (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)).astype(np.float32)
 
 
+def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_matrix:
+    """The sparse matrix (count, count) that is 1 where an edge of the faces joins two vertices, both ways."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    graph = sparse.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count)).tocsr()
+    return ((graph + graph.T) > 0).astype(np.float64)
+
+
 def relax(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], share: Float[np.ndarray, " v"], rounds: int
 ) -> Float[np.ndarray, "v 3"]:
     """Laplacian smoothing: each round moves a vertex by its share in [0, 1] towards the mean of its neighbours."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    ones = np.ones(len(edges))
-    around = sparse.coo_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2).tocsr()
-    around = ((around + around.T) > 0).astype(np.float64)
+    around = neighbours(faces, len(vertices))
     around = sparse.diags(1 / np.maximum(np.asarray(around.sum(1)).ravel(), 1)) @ around
     moved = vertices.astype(np.float64)
     for _ in range(rounds):
@@ -90,14 +74,9 @@ def relax(
     return moved.astype(np.float32)
 
 
-def spread_uvs(piece: Piece) -> Piece:
-    """The piece with its uvs, a corner of the body's square, spread over the whole unit square."""
-    low, high = piece.uvs.min(axis=(0, 1)), piece.uvs.max(axis=(0, 1))
-    return dataclasses.replace(piece, uvs=((piece.uvs - low) / (high - low)).astype(np.float32))
-
-
-def assemble(name: str, rig: Rig, layers: list[Layer], size: int = 1024) -> AvatarMesh:
-    """One mesh and atlas (size, size) of layers, in their order."""
+def assemble(name: str, rig: Rig, layers: list[Layer], *, sole: float = 0.0, size: int = 1024) -> AvatarMesh:
+    """One mesh and atlas (size, size) of layers, in their order; what is on the feet is `sole` metres thick below
+    them."""
     starts = np.cumsum([0] + [len(layer.piece.vertices) for layer in layers])
     vertices = np.concatenate([layer.piece.vertices for layer in layers]).astype(np.float32)
     faces = np.concatenate([layer.piece.faces + start for layer, start in zip(layers, starts, strict=False)])
@@ -127,5 +106,5 @@ def assemble(name: str, rig: Rig, layers: list[Layer], size: int = 1024) -> Avat
         braces=np.concatenate(braces).astype(np.int32),
         fabrics=tuple(p.fabric for p in pieces),
         solid=tuple(p.solid for p in pieces),
-        rig=rig,
+        rig=rig.replace(soles=rig.soles - np.array([0, sole, 0], np.float32)),
     )

@@ -1,60 +1,19 @@
-"""What hangs from the shoulders and the hips of a warrior: a fur collar, a cape down the back, and a pleated kilt."""
+"""What hangs from the shoulders of a warrior: a cape down the back, and a fur collar over its upper edge."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from avatarjax.data.body import Rig
 from avatarjax.data.wardrobe import fabrics, tailoring
-from avatarjax.data.wardrobe.accessories import nearest_weights
-from avatarjax.data.wardrobe.garments import Piece, grid_faces, one_bone, outline, smoothstep
+from avatarjax.data.wardrobe.bones import limb, nearest_weights, one_bone, share
+from avatarjax.data.wardrobe.garments import Piece, grid_faces, smoothstep
+from avatarjax.data.wardrobe.ground import Ground
 from avatarjax.data.wardrobe.textures import noise
 from avatarjax.physics.cloth import Fabric
-
-
-def furry(piece: Piece, thickness: np.ndarray | float, *, tuft: float = 0.012, seed: int = 70) -> Piece:
-    """The piece let out by `thickness`, () or (v,) metres, into fur whose surface is rough by `tuft` metres."""
-    p = piece.vertices.astype(np.float64)
-    rough = 0.7 * noise(p * np.array([1, 0.6, 1]), 0.022, seed) + 0.5 * noise(p, 0.05, seed + 1)
-    share = np.clip(np.asarray(thickness) / 0.02, 0, 1)
-    return tailoring.let_out(piece, thickness + tuft * rough * share, smooth=0.25, rounds=2)
-
-
-def fur_collar(
-    rig: Rig, shell: Piece, *, low: float, front: float = 0.075, sleeve: float = 0.05, thickness: float = 0.05
-) -> Piece:
-    """Fur about the neck and over the shoulders, from a close shell of the body: behind down to height `low`, metres,
-    open in front by `front` to either side, and over the arms as far as `sleeve` past the shoulder joints."""
-    p = shell.vertices.astype(np.float64)
-    arm = rig.heads[rig.index("LeftForeArm")].astype(np.float64) - rig.heads[rig.index("LeftArm")]
-    mirrored = np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], axis=1)
-    along = (mirrored - rig.heads[rig.index("LeftArm")]) @ (arm / np.linalg.norm(arm))
-    neck = rig.heads[rig.index("Neck"), 1]
-    # It hangs lower behind than in front, and less far to the sides.
-    depth = low + 0.5 * np.clip(p[:, 2] + 0.02, 0, 0.1) + 0.12 * np.abs(p[:, 0])
-    throat = np.hypot(p[:, 0], np.minimum(p[:, 2] - 0.02, 0.0)) - 0.052
-    levels = [p[:, 1] - depth, sleeve - along, np.maximum(np.abs(p[:, 0]) - front, 0.03 - p[:, 2])]
-    levels.append(np.maximum(neck - 0.005 - p[:, 1], throat))
-    level = np.min(levels, axis=0)
-    piece = tailoring.clip(shell, level)
-    piece = tailoring.subdivide(tailoring.let_out(piece, 0.008, smooth=0.6, rounds=6))
-    # Its edges are rounded, and thick enough to cover what hangs from below.
-    edge = _from_the_edge(piece)
-    thick = thickness * (0.35 + 0.65 * smoothstep(edge, 0.0, 0.045))
-    return dataclasses.replace(furry(tailoring.spread_uvs(piece), thick), name="fur collar")
-
-
-def _from_the_edge(piece: Piece) -> np.ndarray:
-    """Metres (v,) of each vertex from the nearest open edge of a piece."""
-    from scipy.spatial import cKDTree
-
-    edges = np.sort(np.concatenate([piece.faces[:, [0, 1]], piece.faces[:, [1, 2]], piece.faces[:, [2, 0]]]), axis=1)
-    pairs, count = np.unique(edges, axis=0, return_counts=True)
-    rim = piece.vertices[np.unique(pairs[count == 1])]
-    return cKDTree(rim).query(piece.vertices)[0]
 
 
 def cape(
@@ -77,7 +36,7 @@ def cape(
     heights = np.concatenate([np.linspace(top, free, 5)[:-1], np.linspace(free, bottom, rows - 4)])
     side = np.linspace(-1, 1, columns)
     skin = under[0]
-    trunk = skin.vertices[skin.weights[:, tailoring.bones(rig, "Arm", "Hand")].sum(1) < 0.4]
+    trunk = skin.vertices[share(rig, skin.weights, "Arm", "Hand") < 0.4]
     points = np.zeros((rows, columns, 3))
     behind = 0.0
     for i, y in enumerate(heights):
@@ -89,7 +48,7 @@ def cape(
         points[i, :, 1] = y
         # It lies around the back, and stands off further down.
         points[i, :, 2] = behind - 0.09 * drop + 0.35 * half * side**2 * (1 - 0.6 * drop)
-    ground = tailoring.Ground.of(under)
+    ground = Ground.of(under)
     flat = points.reshape(-1, 3)
     for _ in range(5):
         flat = ground.hold_clear(flat, margin, rounds=1, deepest=0.09)
@@ -125,41 +84,39 @@ def cape(
     )
 
 
-def kilt(
-    rig: Rig,
-    body: Float[np.ndarray, "v 3"],
-    *,
-    top: float,
-    bottom: float,
-    pleats: int = 22,
-    apron: float = 0.75,
-    flare: float = 0.2,
-    margin: float = 0.012,
-    fabric: Fabric = fabrics.WOOL,
-    rows: int = 24,
-    columns: int = 110,
+def fur_collar(
+    rig: Rig, shell: Piece, *, low: float, front: float = 0.075, sleeve: float = 0.05, thickness: float = 0.05
 ) -> Piece:
-    """A kilt from height `top` to `bottom`, metres, around the body vertices (v, 3) (without arms): flat in front over
-    `apron` radians to either side, with `pleats` around the rest; its upper rows are sewn on."""
-    angles = np.arange(columns) * 2 * np.pi / columns
-    heights = np.linspace(top, bottom, rows)
-    centre = np.array([0.0, rig.heads[rig.index("Hips"), 2] + 0.01])
-    radius = np.zeros((rows, columns))
-    for i, y in enumerate(heights):
-        slab = body[np.abs(body[:, 1] - y) < 0.03][:, [0, 2]]
-        fitted = outline(slab, centre, angles) + margin
-        fall = heights[i - 1] - y if i else 0.0
-        radius[i] = np.maximum(fitted, radius[i - 1] + flare * fall) if i else fitted
-    drop = (top - heights) / (top - bottom)
-    behind = np.clip((angles - apron) / (2 * np.pi - 2 * apron), 0, 1)
-    pleated = smoothstep(np.abs(angles - np.pi), np.pi - apron, np.pi - apron - 0.25)
-    wave = 0.5 - 0.5 * np.cos(2 * np.pi * pleats * behind)
-    radius += 0.02 * drop[:, None] ** 0.8 * (wave * pleated)[None]
-    outward = np.stack([np.sin(angles), np.zeros(columns), np.cos(angles)], axis=1)
-    points = outward[None] * radius[..., None] + np.array([centre[0], 0, centre[1]])
-    points[..., 1] = heights[:, None]
-    vertices = points.reshape(-1, 3).astype(np.float32)
-    faces, uvs = grid_faces(rows, columns, closed=True)
-    reach = np.repeat(np.clip(drop - 0.12, 0, None), columns) * (top - bottom) * 1.5
-    weights = one_bone(rig, "Hips", len(vertices))
-    return Piece("kilt", vertices, faces, uvs, weights, reach.astype(np.float32), fabric=fabric, solid=False)
+    """Fur about the neck and over the shoulders, from a close shell of the body: behind down to height `low`, metres,
+    open in front by `front` to either side, and over the arms as far as `sleeve` past the shoulder joints."""
+    p = shell.vertices.astype(np.float64)
+    along = limb(rig, "Arm", "ForeArm").along(p)
+    neck = rig.heads[rig.index("Neck"), 1]
+    # It hangs lower behind than in front, and less far to the sides.
+    depth = low + 0.5 * np.clip(p[:, 2] + 0.02, 0, 0.1) + 0.12 * np.abs(p[:, 0])
+    throat = np.hypot(p[:, 0], np.minimum(p[:, 2] - 0.02, 0.0)) - 0.052
+    levels = [p[:, 1] - depth, sleeve - along, np.maximum(np.abs(p[:, 0]) - front, 0.03 - p[:, 2])]
+    levels.append(np.maximum(neck - 0.005 - p[:, 1], throat))
+    level = np.min(levels, axis=0)
+    piece = tailoring.clip(shell, level)
+    piece = tailoring.subdivide(tailoring.let_out(piece, 0.008, smooth=0.6, rounds=6))
+    # Its edges are rounded, and thick enough to cover what hangs from below.
+    edge = _from_the_edge(piece)
+    thick = thickness * (0.35 + 0.65 * smoothstep(edge, 0.0, 0.045))
+    return dataclasses.replace(furry(tailoring.spread_uvs(piece), thick), name="fur collar")
+
+
+def _from_the_edge(piece: Piece) -> np.ndarray:
+    """Metres (v,) of each vertex from the nearest open edge of a piece."""
+    edges = np.sort(np.concatenate([piece.faces[:, [0, 1]], piece.faces[:, [1, 2]], piece.faces[:, [2, 0]]]), axis=1)
+    pairs, count = np.unique(edges, axis=0, return_counts=True)
+    rim = piece.vertices[np.unique(pairs[count == 1])]
+    return cKDTree(rim).query(piece.vertices)[0]
+
+
+def furry(piece: Piece, thickness: np.ndarray | float, *, tuft: float = 0.012, seed: int = 70) -> Piece:
+    """The piece let out by `thickness`, () or (v,) metres, into fur whose surface is rough by `tuft` metres."""
+    p = piece.vertices.astype(np.float64)
+    rough = 0.7 * noise(p * np.array([1, 0.6, 1]), 0.022, seed) + 0.5 * noise(p, 0.05, seed + 1)
+    deep = np.clip(np.asarray(thickness) / 0.02, 0, 1)
+    return tailoring.let_out(piece, thickness + tuft * rough * deep, smooth=0.25, rounds=2)

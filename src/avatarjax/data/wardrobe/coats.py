@@ -1,5 +1,4 @@
-"""A long open coat: the upper part and sleeves ride on the body like a thick jacket, a collar stands on it, and the
-skirt hangs free from the waist."""
+"""The upper part of an open coat, which rides on the body like a thick jacket, and the collar that stands on it."""
 
 from __future__ import annotations
 
@@ -10,8 +9,8 @@ from jaxtyping import Float
 
 from avatarjax.data.body import Rig
 from avatarjax.data.wardrobe import fabrics, tailoring
-from avatarjax.data.wardrobe.accessories import nearest_weights
-from avatarjax.data.wardrobe.garments import Piece, grid_faces, one_bone, outline, smoothstep
+from avatarjax.data.wardrobe.bones import limb, nearest_weights
+from avatarjax.data.wardrobe.garments import Piece, grid_faces, outline, smoothstep
 from avatarjax.physics.cloth import Fabric
 
 
@@ -23,11 +22,7 @@ def front_opening(p: Float[np.ndarray, "n 3"], edge: np.ndarray | float, middle:
 
 def sleeve_end(rig: Rig, p: Float[np.ndarray, "n 3"], beyond: float = 0.0) -> Float[np.ndarray, " n"]:
     """Metres (n,) before the end of a sleeve, which lies `beyond` metres past the wrist; large off the arms."""
-    wrist = rig.heads[rig.index("LeftHand")].astype(np.float64)
-    along = wrist - rig.heads[rig.index("LeftForeArm")]
-    along /= np.linalg.norm(along)
-    mirrored = np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], axis=1)
-    return beyond - (mirrored - wrist) @ along
+    return beyond - limb(rig, "ForeArm", "Hand", "Hand").along(p)
 
 
 def coat_top(
@@ -93,63 +88,3 @@ def collar(
     vertices = np.concatenate(rows).astype(np.float32)
     faces, uvs = grid_faces(len(rows), columns, closed=False)
     return Piece("collar", vertices, faces, uvs, nearest_weights(vertices, coat.vertices, coat.weights), solid=False)
-
-
-def coat_skirt(
-    rig: Rig,
-    under: Float[np.ndarray, "v 3"],
-    top: Piece,
-    *,
-    start: float,
-    waist: float,
-    bottom: float,
-    gap: float = 0.48,
-    flare: float = 0.19,
-    margin: float = 0.012,
-    folds: int = 11,
-    fabric: Fabric = fabrics.DENIM,
-    rows: int = 30,
-    columns: int = 84,
-) -> Piece:
-    """The skirt of an open coat around the body and legs `under` it (v, 3), from height `start` to `bottom`, metres.
-
-    It overlaps the coat's `top` down to `waist` and is sewn there. `gap` is half the open angle in front, radians;
-    `flare` metres outwards a metre; `margin` metres from what is under it.
-    """
-    angles = np.linspace(gap, 2 * np.pi - gap, columns)
-    heights = np.concatenate([np.linspace(start, waist, 3)[:-1], np.linspace(waist, bottom, rows - 2)])
-    centre = np.array([0.0, rig.heads[rig.index("Hips"), 2] + 0.012])
-    radius = np.zeros((rows, columns))
-    for i, y in enumerate(heights):
-        slab = under[np.abs(under[:, 1] - y) < 0.03][:, [0, 2]]
-        fitted = outline(slab, centre, angles) + margin
-        fall = heights[i - 1] - y if i else 0.0
-        radius[i] = np.maximum(fitted, radius[i - 1] + flare * fall) if i else fitted
-        if heights[i] > waist - 0.08:
-            radius[i, 1:-1] = (radius[i, :-2] + 2 * radius[i, 1:-1] + radius[i, 2:]) / 4
-    drop = np.clip((waist - heights) / (waist - bottom), 0, 1)
-    phase = folds * (angles - np.pi) + 0.6 * np.sin(2 * angles)
-    radius += 0.03 * drop[:, None] ** 1.3 * (np.cos(phase) + 1 - drop[:, None])[:, :]
-    # It hangs further out behind, as a coat does that is cut to flare.
-    radius *= 1 + 0.1 * drop[:, None] * np.clip(-np.cos(angles), 0, None) ** 2
-    # The front edges do not swing inwards over each other.
-    outward = np.stack([np.sin(angles), np.zeros(columns), np.cos(angles)], axis=1)
-    points = outward[None] * radius[..., None] + np.array([centre[0], 0, centre[1]])
-    points[..., 1] = heights[:, None] - 0.012 * drop[:, None] * np.cos(angles)[None]
-    vertices = points.reshape(-1, 3).astype(np.float32)
-    faces, uvs = grid_faces(rows, columns, closed=False)
-    sewn = np.repeat(smoothstep(drop, 0.15, 0.0), columns)[:, None]
-    weights = sewn * nearest_weights(vertices, top.vertices, top.weights) + (1 - sewn) * one_bone(
-        rig, "Hips", len(vertices)
-    )
-    fall = np.clip(waist - 0.015 - np.repeat(heights, columns), 0, None)
-    return Piece(
-        "coat skirt",
-        vertices,
-        faces,
-        uvs,
-        weights.astype(np.float32),
-        (1.5 * fall).astype(np.float32),
-        fabric=fabric,
-        solid=False,
-    )

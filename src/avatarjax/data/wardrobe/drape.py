@@ -2,52 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Ground:
-    """What a sheet lies on: points (v, 3) of closed surfaces, metres, and their outward normals (v, 3)."""
-
-    points: Float[np.ndarray, "v 3"]
-    normals: Float[np.ndarray, "v 3"]
-    tree: cKDTree
-
-    def height(self, p: Float[np.ndarray, "n 3"], count: int = 5) -> tuple[np.ndarray, np.ndarray]:
-        """Metres (n,) that points are above the nearest surface, and the surface's normals there (n, 3)."""
-        distance, nearest = self.tree.query(p, k=count)
-        share = 1 / np.maximum(distance, 1e-4) ** 2
-        share = (share / share.sum(1, keepdims=True))[..., None]
-        normal = (self.normals[nearest] * share).sum(1)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        return ((p - (self.points[nearest] * share).sum(1)) * normal).sum(1), normal
-
-    def clear(self, p: Float[np.ndarray, "n 3"], gap: np.ndarray | float, rounds: int = 6) -> np.ndarray:
-        """The points (n, 3), pushed out until every one of its near neighbours on the surface is `gap` metres below."""
-        p, gap = p.copy(), np.broadcast_to(np.asarray(gap, float), len(p))
-        for _ in range(rounds):
-            _, nearest = self.tree.query(p, k=8)
-            offset = p[:, None] - self.points[nearest]
-            normal = self.normals[nearest]
-            height = (offset * normal).sum(-1)
-            across = np.linalg.norm(offset - height[..., None] * normal, axis=-1)
-            # A neighbour's tangent plane speaks only for its surroundings, and not for the other side of a limb.
-            lack = np.clip(gap[:, None] - height, 0, 0.05) * (across < 0.03) * (height > -0.08)
-            worst = lack.argmax(1)[:, None]
-            p += np.take_along_axis(normal, worst[..., None], 1)[:, 0] * np.take_along_axis(lack, worst, 1)
-        return p
-
-
-def ground(*surfaces: tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]) -> Ground:
-    """A ground of several surfaces, each (points, normals)."""
-    points = np.concatenate([s[0] for s in surfaces]).astype(np.float64)
-    normals = np.concatenate([s[1] for s in surfaces]).astype(np.float64)
-    return Ground(points, normals, cKDTree(points))
+from avatarjax.data.wardrobe import paths
+from avatarjax.data.wardrobe.ground import Ground
 
 
 def outward(
@@ -93,27 +54,20 @@ def fall(
     return np.stack(found)
 
 
-def even(line: Float[np.ndarray, "n 3"], count: int, *, closed: bool = False) -> Float[np.ndarray, "c 3"]:
-    """`count` points (count, 3) spaced evenly along a polyline (n, 3); a closed one starts at its first point and does
-    not repeat it."""
-    if closed:
-        line = np.concatenate([line, line[:1]])
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    at = np.linspace(0, along[-1], count + closed)[:count]
-    return np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
-
-
 def even_grid(rows: Float[np.ndarray, "r n 3"], hem: int = 1, rounds: int = 3) -> Float[np.ndarray, "r n 3"]:
     """The sheet with its vertices moved within it: evenly spaced down each column and, above the last `hem` rows, along
     each row."""
     rows = rows.copy()
     for _ in range(rounds):
-        rows[:-hem] = np.stack([even(row, len(row)) for row in rows[:-hem]])
-        rows = np.stack([even(column, len(rows)) for column in rows.transpose(1, 0, 2)], axis=1)
+        rows[:-hem] = np.stack([paths.even(row, len(row)) for row in rows[:-hem]])
+        rows = np.stack([paths.even(column, len(rows)) for column in rows.transpose(1, 0, 2)], axis=1)
     return rows
 
 
-def walked(rows: Float[np.ndarray, "r n 3"]) -> Float[np.ndarray, "r n"]:
-    """Metres along each column from the first row."""
-    steps = np.linalg.norm(np.diff(rows, axis=0), axis=-1)
-    return np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(steps, axis=0)])
+def settle(points: Float[np.ndarray, "r n 3"], lie_on: Ground, gap: float) -> Float[np.ndarray, "r n 3"]:
+    """The sheet (r, n, 3) evenly meshed and, from its fourth row on, `gap` metres clear of the ground."""
+    gaps = np.repeat(gap * np.minimum(np.arange(len(points)) / 3, 1.0), points.shape[1])
+    for _ in range(3):
+        points = lie_on.clear(points.reshape(-1, 3), gaps).reshape(points.shape)
+        points = even_grid(points, rounds=1)
+    return points

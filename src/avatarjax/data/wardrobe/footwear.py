@@ -1,4 +1,4 @@
-"""Sandals: a sole under the foot and two bands across it."""
+"""Boots, each one sheet from the calf to the toes, and sandals, a sole with two bands."""
 
 from __future__ import annotations
 
@@ -6,8 +6,75 @@ import numpy as np
 from jaxtyping import Float
 
 from avatarjax.data.body import Rig
-from avatarjax.data.wardrobe.accessories import nearest_weights
+from avatarjax.data.wardrobe.bones import nearest_weights
 from avatarjax.data.wardrobe.garments import Piece, grid_faces, outline
+
+_DOWN = np.array([0.0, -1.0, 0.0])
+
+
+def boot(
+    rig: Rig,
+    side: str,
+    body: Float[np.ndarray, "v 3"],
+    weights: Float[np.ndarray, "v j"],
+    *,
+    top: float,
+    margin: float = 0.007,
+    columns: int = 22,
+) -> Piece:
+    """A boot (`side` is Left or Right) from height `top` over one leg of the body (v, 3), in one sheet.
+
+    Its rings are level down to the ankle, fan about the instep around the heel, and walk upright to the toes. Each
+    ring is the convex outline of the leg in its plane, `margin` metres outside the skin.
+    """
+    ankle = rig.heads[rig.index(side + "Foot")].astype(np.float64)
+    toe = rig.tails[rig.index(side + "ToeBase")]
+    along = (toe - ankle) * np.array([1, 0, 1])
+    along = along / np.linalg.norm(along)
+    lateral = np.cross([0.0, 1.0, 0.0], along)
+    leg = body[(np.abs(body[:, 0] - ankle[0]) < 0.12) & (body[:, 1] < top + 0.04)]
+    pivot = ankle + 0.062 * along + np.array([0, 0.035, 0])
+    reach = ((leg - pivot) @ along)[leg[:, 1] < 0.05].max() + margin + 0.012
+
+    planes = [(np.array([pivot[0], y, pivot[2]]), -along) for y in np.linspace(top, pivot[1], 9)[:-1]]
+    for angle in np.linspace(0, np.pi / 2, 9)[:-1]:
+        planes.append((pivot, -along * np.cos(angle) + _DOWN * np.sin(angle)))
+    planes += [(pivot + along * s, _DOWN) for s in reach * np.array([0, 0.15, 0.3, 0.45, 0.6, 0.72, 0.82, 0.91])]
+    angles = np.arange(columns) * 2 * np.pi / columns
+    centres, radii, last = [], [], 0.0
+    for i, (origin, deep) in enumerate(planes):
+        offset = leg - origin
+        # Rows of vertices are 2 cm apart on the calf, closer on the foot.
+        near = np.abs(offset @ np.cross(lateral, deep)) < (0.03 if i < 8 else 0.014)
+        if origin is pivot:
+            near &= offset @ deep > 0
+        flat = np.stack([offset[near] @ lateral, offset[near] @ deep], axis=1)
+        centre = (flat.min(0) + flat.max(0)) / 2
+        centres.append(origin + centre[0] * lateral + centre[1] * deep)
+        radii.append(outline(flat, centre, angles) + margin)
+    radii = np.array(radii)
+    for _ in range(2):
+        radii[1:-1] = (radii[:-2] + 2 * radii[1:-1] + radii[2:]) / 4
+    # The shaft widens towards its top, and the toe is closed by two small rings.
+    radii[:6] += 0.014 * np.linspace(1, 0, 6)[:, None] ** 2
+    rings = []
+    for (_, deep), centre, radius in zip(planes, centres, radii, strict=True):
+        rings.append(centre + radius[:, None] * (np.sin(angles)[:, None] * lateral + np.cos(angles)[:, None] * deep))
+    for share, size in ((0.97, 0.6), (1.0, 0.02)):
+        last = centres[-1] + (pivot + along * reach * share - centres[-1]) @ along * along
+        rings.append(last + (rings[len(planes) - 1] - centres[-1]) * size + _DOWN * 0.006 * (1 - size))
+    points = np.stack(rings)
+    points[..., 1] = np.maximum(points[..., 1], -0.012)
+    faces, uvs = grid_faces(len(rings), columns, closed=True)
+    vertices = points.reshape(-1, 3).astype(np.float32)
+    # Columns run from behind to the side, so the other way round than the grid takes them to.
+    return Piece(
+        side.lower() + " boot",
+        vertices,
+        faces[:, [0, 2, 1]],
+        uvs[:, [0, 2, 1]],
+        nearest_weights(vertices, body, weights),
+    )
 
 
 def sandal(

@@ -1,4 +1,4 @@
-"""Pieces of clothing and hair as small meshes grown around a shaped body: skirt, boots, hat, hair."""
+"""What every garment is made of: the piece, its grid of triangles, and the outline of what it goes around."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from avatarjax.data.body import Rig
 from avatarjax.data.wardrobe import fabrics
 from avatarjax.physics.cloth import Fabric
 
@@ -50,11 +49,17 @@ def grid_faces(rows: int, columns: int, *, closed: bool) -> tuple[np.ndarray, np
     return faces.astype(np.int32), np.concatenate([uv[:, [0, 1, 2]], uv[:, [0, 2, 3]]])
 
 
-def one_bone(rig: Rig, name: str, count: int) -> np.ndarray:
-    """Skinning weights (count, j) that are all on one bone."""
-    weights = np.zeros((count, len(rig.names)), np.float32)
-    weights[:, rig.index(name)] = 1
-    return weights
+def facing_out(
+    vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, uvs: np.ndarray, middle: Float[np.ndarray, "_ 3"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The faces (f, 3) and uvs (f, 3, 2), turned over if they look towards the `middle`, (v, 3) or (1, 3), that each
+    vertex (v, 3) lies around."""
+    corner = vertices[faces]
+    flat = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    inside = np.broadcast_to(middle, vertices.shape)[faces].mean(1)
+    if (flat * (corner.mean(1) - inside)).sum() < 0:
+        faces, uvs = faces[:, [0, 2, 1]], uvs[:, [0, 2, 1]]
+    return faces, uvs
 
 
 def smoothstep(x: np.ndarray, low: _Edge, high: _Edge) -> np.ndarray:
@@ -72,43 +77,3 @@ def outline(points: np.ndarray, centre: np.ndarray, angles: np.ndarray) -> np.nd
     facing = directions @ directions.T
     reach = np.where(facing > 0.05, support[None] / np.maximum(facing, 0.05), np.inf)
     return reach.min(axis=1)
-
-
-def skirt(
-    rig: Rig,
-    body: Float[np.ndarray, "v 3"],
-    *,
-    top: float,
-    bottom: float,
-    flare: float = 0.32,
-    margin: float = 0.012,
-    fabric: Fabric = fabrics.DENIM,
-    folds: int = 11,
-    rows: int = 26,
-    columns: int = 66,
-) -> Piece:
-    """A skirt from height `top` to `bottom` around the body vertices (v, 3) (without arms); its upper rows are sewn on.
-
-    `flare` is the outward slope, `margin` the distance from the skin, both in metres (per metre).
-    """
-    angles = np.arange(columns) * 2 * np.pi / columns
-    heights = np.linspace(top, bottom, rows)
-    centre = np.array([0.0, rig.heads[rig.index("Hips"), 2]])
-    radius = np.zeros((rows, columns))
-    for i, y in enumerate(heights):
-        slab = body[np.abs(body[:, 1] - y) < 0.03][:, [0, 2]]
-        fitted = outline(slab, centre, angles) + margin
-        fall = heights[i - 1] - y if i else 0.0
-        radius[i] = np.maximum(fitted, radius[i - 1] + flare * fall) if i else fitted
-    drop = (top - heights) / (top - bottom)
-    ripple = 0.018 * drop[:, None] ** 1.5 * np.cos(folds * angles + 0.5 * np.sin(2 * angles))[None]
-    radius = radius + ripple
-    outward = np.stack([np.sin(angles), np.zeros(columns), np.cos(angles)], axis=1)
-    points = outward[None] * radius[..., None] + np.array([centre[0], 0, centre[1]])
-    points[..., 1] = heights[:, None]
-    vertices = points.reshape(-1, 3).astype(np.float32)
-    faces, uvs = grid_faces(rows, columns, closed=True)
-
-    weights = one_bone(rig, "Hips", len(vertices))
-    reach = np.repeat(np.clip(drop - 0.08, 0, None), columns) * (top - bottom) * 1.6
-    return Piece("skirt", vertices, faces, uvs, weights, reach.astype(np.float32), fabric=fabric, solid=False)

@@ -1,5 +1,4 @@
-"""Cutting and fitting: clipping a piece along a smooth line, letting it out, and holding cloth clear of what is under
-it."""
+"""Cutting and fitting pieces: clipped along a smooth line, let out, spanned over hollows, subdivided and joined."""
 
 from __future__ import annotations
 
@@ -7,10 +6,10 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial import cKDTree
+from jaxtyping import Bool, Float
+from scipy import sparse
+from scipy.sparse import linalg
 
-from avatarjax.data.body import Rig
 from avatarjax.data.wardrobe import assembly
 from avatarjax.data.wardrobe.garments import Piece
 
@@ -77,68 +76,26 @@ def clip(piece: Piece, level: Float[np.ndarray, " v"]) -> Piece:
     )
 
 
-def spread_uvs(piece: Piece, margin: float = 0.01) -> Piece:
-    """The piece's corner of a uv square, spread over a square of its own but for a `margin`."""
-    low, high = piece.uvs.min(axis=(0, 1)), piece.uvs.max(axis=(0, 1))
-    spread = margin + (piece.uvs - low) / (high - low) * (1 - 2 * margin)
-    return dataclasses.replace(piece, uvs=spread.astype(np.float32))
-
-
-def let_out(piece: Piece, thickness: np.ndarray | float, smooth: float = 0.6, rounds: int = 8) -> Piece:
-    """The piece relaxed (`smooth` in [0, 1] a round) and then moved outwards by `thickness` () or (v,) metres."""
-    share = np.full(len(piece.vertices), smooth, np.float32)
+def let_out(piece: Piece, thickness: np.ndarray | float, smooth: np.ndarray | float = 0.6, rounds: int = 8) -> Piece:
+    """The piece relaxed, by `smooth` in [0, 1] a round, and then moved outwards by `thickness` metres; both are () or
+    (v,)."""
+    share = np.broadcast_to(np.asarray(smooth, np.float32), (len(piece.vertices),))
     vertices = assembly.relax(piece.vertices, piece.faces, share, rounds)
     normals = assembly.vertex_normals(vertices, piece.faces)
     out = vertices + normals * np.broadcast_to(thickness, (len(vertices),))[:, None]
     return dataclasses.replace(piece, vertices=out.astype(np.float32))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Ground:
-    """Solid pieces that cloth stays clear of: places (n, 3) all over their surfaces, and the normals (n, 3) there."""
-
-    places: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    tree: cKDTree
-
-    @classmethod
-    def of(cls, pieces: Sequence[Piece]) -> Ground:
-        """The ground that some pieces make together."""
-        # The corners, the middles of the edges, and the centre of each triangle.
-        mixes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1], [1, 1, 1]], float)
-        mixes /= mixes.sum(1, keepdims=True)
-        places, normals = [], []
-        for piece in pieces:
-            smooth = assembly.vertex_normals(piece.vertices, piece.faces).astype(np.float64)
-            places.append(np.einsum("mk,fkd->fmd", mixes, piece.vertices[piece.faces]).reshape(-1, 3))
-            normals.append(np.einsum("mk,fkd->fmd", mixes, smooth[piece.faces]).reshape(-1, 3))
-        place, normal = np.concatenate(places), np.concatenate(normals)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        return cls(place, normal, cKDTree(place))
-
-    def clearance(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-        """Metres (n,) of points outside the nearest places, along their normals (n, 3); negative inside."""
-        _, nearest = self.tree.query(points, k=3)
-        normal = self.normals[nearest].mean(1)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        return ((points[:, None] - self.places[nearest]) * normal[:, None]).sum(-1).min(1), normal
-
-    def hold_clear(
-        self, points: Float[np.ndarray, "n 3"], margin: np.ndarray | float, rounds: int = 3, deepest: float = 0.06
-    ) -> Float[np.ndarray, "n 3"]:
-        """Points (n, 3) pushed out until they are `margin` metres, () or (n,), away; what lies deeper than `deepest`
-        metres is taken to be beyond the far side, and left."""
-        moved = points.astype(np.float64)
-        for _ in range(rounds):
-            depth, normal = self.clearance(moved)
-            push = np.where(depth > -deepest, np.clip(margin - depth, 0, deepest), 0)
-            moved = moved + normal * push[:, None]
-        return moved
-
-
-def bones(rig: Rig, *words: str) -> list[int]:
-    """The joint numbers whose names contain one of the words."""
-    return [i for i, name in enumerate(rig.names) if any(word in name for word in words)]
+def span(piece: Piece, over: Bool[np.ndarray, " v"]) -> Piece:
+    """The piece with some of its vertices, `over` (v,), drawn tight as a membrane between the others, as cloth or hair
+    is over a hollow, a nipple or an ear."""
+    count, faces = len(piece.vertices), piece.faces
+    graph = assembly.neighbours(faces, count)
+    laplacian = (sparse.diags(np.asarray(graph.sum(1)).ravel()) - graph).tocsr()[over]
+    fixed = piece.vertices[~over].astype(np.float64)
+    vertices = piece.vertices.copy()
+    vertices[over] = linalg.spsolve(laplacian[:, over].tocsc(), -(laplacian[:, ~over] @ fixed))
+    return dataclasses.replace(piece, vertices=vertices)
 
 
 def subdivide(piece: Piece) -> Piece:
@@ -159,16 +116,28 @@ def subdivide(piece: Piece) -> Piece:
     )
 
 
-def join(name: str, parts: list[tuple[Piece, tuple[float, float, float, float]]]) -> Piece:
-    """One solid piece of rigid parts, each with the place (u0, v0, u1, v1) of its uv square in that of the whole."""
-    starts = np.cumsum([0] + [len(part.vertices) for part, _ in parts])
-    places = [np.array(place, np.float32) for _, place in parts]
+def spread_uvs(piece: Piece, margin: float = 0.01) -> Piece:
+    """The piece's corner of a uv square, spread over a square of its own but for a `margin`."""
+    low, high = piece.uvs.min(axis=(0, 1)), piece.uvs.max(axis=(0, 1))
+    spread = margin + (piece.uvs - low) / (high - low) * (1 - 2 * margin)
+    return dataclasses.replace(piece, uvs=spread.astype(np.float32))
+
+
+def join(name: str, parts: Sequence[Piece], places: Sequence[tuple[float, float, float, float]] | None = None) -> Piece:
+    """One solid piece of cotton of several, each with the place (u0, v0, u1, v1) of its uv square in that of the whole;
+    without places all have the whole of it."""
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts])[:-1]
+    corners = np.array(places if places else [(0, 0, 1, 1)] * len(parts), np.float32)
+    reaches = [np.zeros(len(part.vertices), np.float32) if part.reach is None else part.reach for part in parts]
+    braces = [part.braces + start for part, start in zip(parts, starts, strict=True) if part.braces is not None]
     return Piece(
         name,
-        np.concatenate([part.vertices for part, _ in parts]),
-        np.concatenate([part.faces + start for (part, _), start in zip(parts, starts, strict=False)]).astype(np.int32),
-        np.concatenate(
-            [at[:2] + part.uvs * (at[2:] - at[:2]) for (part, _), at in zip(parts, places, strict=True)]
-        ).astype(np.float32),
-        np.concatenate([part.weights for part, _ in parts]),
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]).astype(np.int32),
+        np.concatenate([at[:2] + part.uvs * (at[2:] - at[:2]) for part, at in zip(parts, corners, strict=True)]).astype(
+            np.float32
+        ),
+        np.concatenate([part.weights for part in parts]),
+        np.concatenate(reaches),
+        np.concatenate(braces).astype(np.int32) if braces else None,
     )

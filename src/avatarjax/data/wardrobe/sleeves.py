@@ -1,4 +1,4 @@
-"""The loose parts of robes and long dresses: a skirt to the ankles in deep folds, and wide sleeves that hang."""
+"""Wide sleeves that hang from the arms."""
 
 from __future__ import annotations
 
@@ -6,62 +6,17 @@ import numpy as np
 from jaxtyping import Float
 
 from avatarjax.data.body import Rig
-from avatarjax.data.wardrobe import drape, fabrics
-from avatarjax.data.wardrobe.accessories import nearest_weights
-from avatarjax.data.wardrobe.garments import Piece, grid_faces, one_bone, outline, smoothstep
+from avatarjax.data.wardrobe import fabrics, paths
+from avatarjax.data.wardrobe.bones import nearest_weights
+from avatarjax.data.wardrobe.garments import Piece, grid_faces, outline, smoothstep
+from avatarjax.data.wardrobe.ground import Ground
 from avatarjax.physics.cloth import Fabric
-
-
-def long_skirt(
-    rig: Rig,
-    body: Float[np.ndarray, "v 3"],
-    *,
-    top: float,
-    bottom: float,
-    flare: float = 0.17,
-    depth: float = 0.045,
-    folds: int = 13,
-    margin: float = 0.012,
-    fabric: Fabric = fabrics.WOOL,
-    rows: int = 42,
-    columns: int = 88,
-) -> Piece:
-    """A floor-length skirt from height `top` to `bottom` around the body (v, 3) without its arms, sewn on at the top.
-
-    `flare` is the outward slope; `depth` (metres) how deep the `folds` are at the hem, `margin` the gap to the skin.
-    """
-    angles = np.arange(columns) * 2 * np.pi / columns
-    heights = np.linspace(top, bottom, rows)
-    centre = np.array([0.0, rig.heads[rig.index("Hips"), 2]])
-    radius = np.zeros((rows, columns))
-    for i, y in enumerate(heights):
-        slab = body[np.abs(body[:, 1] - y) < 0.03][:, [0, 2]]
-        # Cloth that hangs from the belt is stretched over the hips, and does not follow a hollow back.
-        fitted = outline(slab, centre, angles) + margin * min(1.0, 0.3 + 0.35 * i)
-        radius[i] = np.maximum(fitted, radius[i - 1] + flare * (heights[i - 1] - y)) if i else fitted
-    for _ in range(3):
-        around = (np.roll(radius, 1, 1) + 2 * radius + np.roll(radius, -1, 1)) / 4
-        radius = np.maximum(radius, around)
-    drop = (top - heights) / (top - bottom)
-    # No two folds are alike, but left and right are: they are waves of the angle from the front.
-    phase = folds * angles + 0.9 * np.sin(2 * angles) + 0.5 * np.sin(3 * angles)
-    wave = 0.5 + 0.5 * np.cos(phase - phase[0]) * (0.8 + 0.2 * np.cos(5 * angles))
-    radius = radius + (depth * drop**0.9 + 0.006 * smoothstep(drop, 0.0, 0.04))[:, None] * wave[None]
-    outward = np.stack([np.sin(angles), np.zeros(columns), np.cos(angles)], axis=1)
-    points = outward[None] * radius[..., None] + np.array([centre[0], 0, centre[1]])
-    points[..., 1] = heights[:, None]
-    faces, uvs = grid_faces(rows, columns, closed=True)
-    down = drape.walked(points)
-    reach = 1.3 * np.clip(down - down[1], 0, None)
-    vertices = points.reshape(-1, 3).astype(np.float32)
-    weights = one_bone(rig, "Hips", len(vertices))
-    return Piece("skirt", vertices, faces, uvs, weights, reach.ravel().astype(np.float32), fabric=fabric, solid=False)
 
 
 def sleeve_bell(
     rig: Rig,
     side: str,
-    lie_on: drape.Ground,
+    lie_on: Ground,
     weights: Float[np.ndarray, "v j"],
     *,
     start: float,
@@ -83,9 +38,9 @@ def sleeve_bell(
     mirror = np.array([1.0 if side == "Left" else -1.0, 1, 1])
     joints = [rig.heads[rig.index(side + n)] * mirror for n in ("Arm", "ForeArm", "Hand")]
     joints.append(rig.tails[rig.index(side + "Hand")] * mirror)
-    path = drape.even(np.stack(joints), 400)
+    path = paths.even(np.stack(joints), 400)
     # An elbow is rounder in a sleeve than in the skeleton.
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    along = paths.walked(path)
     kernel = np.hanning(141) / np.hanning(141).sum()
     tangents = np.gradient(path, axis=0)
     padded = np.pad(tangents, ((70, 70), (0, 0)), mode="edge")
@@ -99,7 +54,7 @@ def sleeve_bell(
     # Fingers look every way, and the sleeve ends before them.
     fingers = [rig.index(n) for n in rig.names if n.startswith(side + "Hand") and n != side + "Hand"]
     palm = weights[:, fingers].sum(1) < 0.3
-    clear_of = drape.ground((lie_on.points[palm], lie_on.normals[palm]))
+    clear_of = Ground.at((lie_on.points[palm], lie_on.normals[palm]))
     angles = np.arange(columns) * 2 * np.pi / columns
     rings = []
     shares = np.linspace(0, 1, rows)
@@ -122,7 +77,7 @@ def sleeve_bell(
         wide = fitted * np.sin(angles) * (1 + width * share / 0.06 * (1 + 0.5 * np.cos(angles)))
         low = fitted * np.cos(angles) + drop * share**1.4 * smoothstep(np.cos(angles), -0.6, 0.9)
         ring = centre + wide[:, None] * across + low[:, None] * hang
-        rings.append(drape.even(ring, columns, closed=True))
+        rings.append(paths.even(ring, columns, closed=True))
     points = np.stack(rings)
     for _ in range(2):
         points[2:-1] = (points[1:-2] + 2 * points[2:-1] + points[3:]) / 4
@@ -138,12 +93,12 @@ def sleeve_bell(
             height, normal = clear_of.height(points[i])
             points[i] -= normal * np.clip(height - 0.004 * i, 0, 0.03)[:, None]
         points[i] = clear_of.clear(points[i], 0.75 * margin * min(1.0, (i + 2) / 7))
-        points[i] = drape.even(points[i], columns, closed=True)
+        points[i] = paths.even(points[i], columns, closed=True)
     faces, uvs = grid_faces(rows, columns, closed=True)
     if side == "Left":
         faces, uvs = faces[:, ::-1].copy(), uvs[:, ::-1].copy()
-    points[1:] = np.stack([drape.even(column, rows - 1) for column in points[1:].transpose(1, 0, 2)], axis=1)
-    down = drape.walked(points)
+    points[1:] = np.stack([paths.even(column, rows - 1) for column in points[1:].transpose(1, 0, 2)], axis=1)
+    down = paths.walked(points)
     reach = 1.3 * np.clip(down - down[1], 0, None)
     vertices = points.reshape(-1, 3).astype(np.float32)
     carried = nearest_weights(vertices, lie_on.points[on_arm], weights[on_arm])

@@ -1,29 +1,22 @@
-"""Beards and braids: tubes of strands that hang from where they grow, braced so that they stay round."""
+"""Hair that hangs: braids, wild locks and a beard as tubes of strands, and long hair as sheets beside the face."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 from jaxtyping import Float
 
 from avatarjax.data.body import Rig
-from avatarjax.data.wardrobe import fabrics
-from avatarjax.data.wardrobe.garments import Piece, grid_faces, one_bone, smoothstep
-from avatarjax.data.wardrobe.tailoring import Ground
+from avatarjax.data.wardrobe import drape, fabrics, paths, tailoring
+from avatarjax.data.wardrobe.bones import head_then_chest, one_bone
+from avatarjax.data.wardrobe.garments import Piece, facing_out, grid_faces, smoothstep
+from avatarjax.data.wardrobe.ground import Ground
+from avatarjax.data.wardrobe.textures import mix
 from avatarjax.physics.cloth import Fabric
 
 
-def path_through(knots: Float[np.ndarray, "k 3"], count: int) -> Float[np.ndarray, "n 3"]:
-    """`count` points (n, 3) at even distances along a smooth curve through knots (k, 3)."""
-    from scipy.interpolate import CubicSpline
-
-    lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
-    fine = CubicSpline(lengths, knots)(np.linspace(0, lengths[-1], 40 * count))
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])
-    even = np.linspace(0, along[-1], count)
-    return np.stack([np.interp(even, along, fine[:, k]) for k in range(3)], axis=1)
-
-
-def tube(
+def strands(
     name: str,
     path: Float[np.ndarray, "n 3"],
     aside: Float[np.ndarray, "3"],
@@ -41,24 +34,11 @@ def tube(
     ring have its weights (n, j) and reach (n,); braces join those that are opposite, and rings two apart along the path
     on four sides, so that the tube keeps its section and resists kinks.
     """
-    along = np.gradient(path, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
     # Rings turn about the vertical only, where a section that minimises twist would drift.
-    across = np.cross(along, aside)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    side = np.cross(across, along)
-    angles = np.arange(columns) * 2 * np.pi / columns
-    rings = (
-        path[:, None]
-        + (widths[:, None] * np.sin(angles))[..., None] * side[:, None]
-        + (depths[:, None] * np.cos(angles))[..., None] * across[:, None]
-    )
+    across, side = paths.frame(paths.tangents(path), aside)
+    vertices = paths.rings(path, depths[:, None] * across, widths[:, None] * side, columns).reshape(-1, 3)
     faces, uvs = grid_faces(len(path), columns, closed=True)
-    vertices = rings.reshape(-1, 3)
-    corners = vertices[faces]
-    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    if (outward * (corners.mean(1) - np.repeat(path, columns, 0)[faces].mean(1))).sum() < 0:
-        faces, uvs = faces[:, [0, 2, 1]], uvs[:, [0, 2, 1]]
+    faces, uvs = facing_out(vertices, faces, uvs, np.repeat(path, columns, axis=0))
     index = np.arange(len(vertices)).reshape(len(path), columns)
     half = columns // 2
     opposite = np.stack([index[:, :half], index[:, half : 2 * half]], axis=-1).reshape(-1, 2)
@@ -96,12 +76,9 @@ def braid(
     `width` is its half width and `sewn` the length that does not swing, metres. Its width pulses with the plaits, and
     it ends in a tie and a tuft.
     """
-    path = path_through(knots, rows)
+    path = paths.through(knots, rows)
     hangs = smoothstep(np.linspace(0, 1, rows), 0.03, 0.16)
-    for _ in range(4):
-        path = ground.hold_clear(path, (margin + width) * hangs - (1 - hangs), rounds=2)
-        path[1:-1] = (path[:-2] + 2 * path[1:-1] + path[2:]) / 4
-    path = path_through(path, rows)
+    path = _hang(path, ground, margin + width, hangs, rounds=2)
     s = np.linspace(0, 1, rows)
     pulse = 0.86 + 0.14 * np.abs(np.cos(np.pi * plaits * s / 0.86))
     taper = width * (1 - 0.25 * s) * pulse
@@ -111,15 +88,21 @@ def braid(
     length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
     reach = 1.3 * np.clip(s * length - sewn, 0, None)
     weights = one_bone(rig, root, rows)
-    return tube(name, path, np.array([1.0, 0, 0]), radius, 0.85 * radius, weights, reach, columns=columns)
+    return strands(name, path, np.array([1.0, 0, 0]), radius, 0.85 * radius, weights, reach, columns=columns)
+
+
+def _hang(path: np.ndarray, ground: Ground, gap: np.ndarray | float, hangs: np.ndarray, rounds: int = 1) -> np.ndarray:
+    """Points (n, 3) evenly along the path, held `gap` metres clear of the ground where it `hangs`, (n,) in [0, 1]."""
+    for _ in range(4):
+        path = ground.hold_clear(path, gap * hangs - (1 - hangs), rounds=rounds)
+        path[1:-1] = (path[:-2] + 2 * path[1:-1] + path[2:]) / 4
+    return paths.through(path, len(path))
 
 
 def paint_braid(
     uv: Float[np.ndarray, "n 2"], hair: Float[np.ndarray, "3"], tie: Float[np.ndarray, "3"], plaits: int = 9
 ) -> Float[np.ndarray, "n 3"]:
     """Colours (n, 3) in 0..255 of a `braid`: strands cross in chevrons with dark gaps, a `tie` holds the tuft."""
-    from avatarjax.data.wardrobe.textures import mix
-
     s, turn = 1 - uv[:, 1], uv[:, 0] * 2 * np.pi
     # Seen from the front or the back, each strand runs down from its edge to the middle.
     slant = np.abs(np.sin(turn))
@@ -160,7 +143,7 @@ def full_beard(
             [0, bottom, chin[2] + 0.01],
         ]
     )
-    path = path_through(knots, rows)
+    path = paths.through(knots, rows)
     s = np.linspace(0, 1, rows)
     wide = width * np.interp(s, [0, 0.2, 0.45, 0.75, 0.93, 1], [0.8, 1.0, 0.98, 0.66, 0.3, 0.1])
     deep = depth * np.interp(s, [0, 0.2, 0.5, 0.8, 1], [0.8, 1.0, 0.95, 0.6, 0.12])
@@ -171,28 +154,18 @@ def full_beard(
         path[:, 2] = held[:, 2]
         path[1:-1] = (path[:-2] + 2 * path[1:-1] + path[2:]) / 4
     path[:, 0] = 0
-    fall = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    fall = paths.walked(path)
     start = np.interp(0.0, chin[1] - 0.045 - path[:, 1], fall)
     reach = 1.3 * np.clip(fall - start, 0, None)
     weights = one_bone(rig, "Head", rows)
-    piece = tube("beard", path, np.array([1.0, 0, 0]), wide, deep, weights, reach, columns=columns)
+    piece = strands("beard", path, np.array([1.0, 0, 0]), wide, deep, weights, reach, columns=columns)
     points = piece.vertices.astype(np.float64).reshape(rows, columns, 3)
     # Locks: the surface is ridged along the strands, and the tip is ragged.
     angle = np.arange(columns) * 2 * np.pi / columns
     lock = 1 + 0.07 * np.sin(5 * angle + 0.7) * smoothstep(s, 0.15, 0.4)[:, None]
     centre = points.mean(1, keepdims=True)
     points = centre + (points - centre) * lock[..., None]
-    return Piece(
-        piece.name,
-        points.reshape(-1, 3).astype(np.float32),
-        piece.faces,
-        piece.uvs,
-        piece.weights,
-        piece.reach,
-        piece.braces,
-        piece.fabric,
-        solid=False,
-    )
+    return dataclasses.replace(piece, vertices=points.reshape(-1, 3).astype(np.float32))
 
 
 def locks(
@@ -230,38 +203,79 @@ def locks(
             back = np.array([share, share, share**0.8])
             knots.append(start + back * (tip - start) + (1.2 + share) * thick * level + sway[k])
         knots = np.array(knots)
-        path = path_through(knots, rows)
+        path = paths.through(knots, rows)
         s = np.linspace(0, 1, rows)
         girth = thick * np.interp(s, [0, 0.15, 0.5, 0.85, 1], [0.75, 1.0, 1.05, 0.6, 0.16])
         hangs = smoothstep(s, 0.08, 0.25)
-        for _ in range(4):
-            path = ground.hold_clear(path, (margin + girth) * hangs - (1 - hangs), rounds=1)
-            path[1:-1] = (path[:-2] + 2 * path[1:-1] + path[2:]) / 4
-        path = path_through(path, rows)
+        path = _hang(path, ground, margin + girth, hangs)
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
         reach = 1.3 * np.clip(s * length - sewn, 0, None)
         aside = np.array([level[2], 0, -level[0]])
         weights = one_bone(rig, "Head", rows)
-        tubes.append(tube("hair", path, aside, girth, 0.8 * girth, weights, reach, columns=columns))
-    starts = np.arange(len(tubes)) * rows * columns
-    braces = [t.braces + start for t, start in zip(tubes, starts, strict=True) if t.braces is not None]
-    uvs = []
+        tubes.append(strands("hair", path, aside, girth, 0.8 * girth, weights, reach, columns=columns))
     for k, t in enumerate(tubes):
         # Each lock has a strip of the uv square of its own.
-        uvs.append(t.uvs * np.array([0.96 / len(tubes), 1], np.float32) + np.array([k / len(tubes), 0], np.float32))
-    vertices = np.concatenate([t.vertices for t in tubes])
-    reach = np.concatenate([t.reach for t in tubes if t.reach is not None])
+        uvs = t.uvs * np.array([0.96 / len(tubes), 1], np.float32) + np.array([k / len(tubes), 0], np.float32)
+        tubes[k] = dataclasses.replace(t, uvs=uvs)
+    hair = tailoring.join("hair", tubes)
     # Where a tube as a whole went astray between two surfaces, its own vertices give way.
-    free = reach > 0
+    vertices, free = hair.vertices.copy(), np.concatenate([t.reach > 0 for t in tubes])
     vertices[free] = ground.hold_clear(vertices[free], 0.011, rounds=5)
-    return Piece(
-        "hair",
-        vertices,
-        np.concatenate([t.faces + start for t, start in zip(tubes, starts, strict=True)]).astype(np.int32),
-        np.concatenate(uvs),
-        np.concatenate([t.weights for t in tubes]),
-        reach,
-        np.concatenate(braces).astype(np.int32),
-        fabrics.HAIR,
-        solid=False,
-    )
+    return dataclasses.replace(hair, vertices=vertices, fabric=fabrics.HAIR, solid=False)
+
+
+def front_hair(
+    rig: Rig,
+    side: str,
+    lie_on: Ground,
+    centre: Float[np.ndarray, "3"],
+    *,
+    length: float,
+    hairline: float,
+    crown: float,
+    temple: float,
+    gap: float = 0.012,
+    fabric: Fabric = fabrics.HAIR,
+    rows: int = 40,
+    columns: int = 18,
+) -> Piece:
+    """Long hair on one side (Left or Right) of a parting in the middle of the head (around `centre`), which falls to
+    the front of the shoulder.
+
+    The parting runs from `hairline` to `crown`, radians from straight ahead over the top; the hair keeps `temple`
+    metres from the middle of the face; it is `length` metres long.
+    """
+    sign = 1.0 if side == "Left" else -1.0
+    share = np.linspace(0, 1, columns)
+    turn = hairline + (crown - hairline) * share
+    up = np.stack([np.full(columns, 0.012 * sign), np.sin(turn), np.cos(turn)], axis=1)
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    head = lie_on.points[lie_on.points[:, 1] > centre[1] - 0.1]
+    roots = lie_on.clear(paths.even(drape.outward(head, centre, up), columns), 0.006)
+
+    def pull(p: np.ndarray, gone: np.ndarray) -> np.ndarray:
+        x = p[:, 0] * sign
+        # Combed away from the parting, then down; in front of the shoulder.
+        edge = temple + 0.035 * share
+        aside = 1.7 * smoothstep(edge - x, -0.01, 0.03) * (gone < 0.25)
+        ahead = 0.75 * smoothstep(gone, 0.14, 0.24) * smoothstep(gone, 0.42, 0.3) * smoothstep(p[:, 2], 0.13, 0.05)
+        inward = -0.3 * smoothstep(gone, 0.2, 0.3) * smoothstep(x - temple - 0.085 * share, 0.0, 0.05)
+        return np.stack([(aside + inward) * sign, -np.ones(columns), ahead], axis=1)
+
+    ragged = 1 + 0.03 * np.sin(share * 12) + 0.015 * np.sin(share * 19 + 1)
+    # The way over the crown is longer than that from the forehead.
+    lengths = length * ragged + 1.2 * (roots[:, 1] - roots[0, 1]) + 0.05 * share
+    points = drape.fall(roots, lengths, rows, lie_on, pull=pull, gap=gap, ease=3, smooth=0.3)
+    for _ in range(2):
+        points[3:-1] = (points[2:-2] + 2 * points[3:-1] + points[4:]) / 4
+    points = drape.settle(points, lie_on, 0.8 * gap)
+    gone = paths.walked(points)
+    faces, uvs = grid_faces(rows, columns, closed=False)
+    if side == "Right":
+        faces, uvs = faces[:, ::-1].copy(), uvs[:, ::-1].copy()
+    vertices = points.reshape(-1, 3).astype(np.float32)
+    # On the head it is combed down; what hangs is free.
+    reach = 1.3 * np.clip(gone - 0.15, 0, None)
+    weights = head_then_chest(rig, vertices)
+    name = side.lower() + " hair"
+    return Piece(name, vertices, faces, uvs, weights, reach.ravel().astype(np.float32), fabric=fabric, solid=False)

@@ -1,4 +1,4 @@
-"""What hangs from head and shoulders: a hood that lies on the back, a veil, and long hair to both sides of a face."""
+"""What is worn on the head: a cowboy hat, a hood that lies on the back, and a veil."""
 
 from __future__ import annotations
 
@@ -6,17 +6,62 @@ import numpy as np
 from jaxtyping import Float
 
 from avatarjax.data.body import Rig
-from avatarjax.data.wardrobe import drape, fabrics
-from avatarjax.data.wardrobe.accessories import nearest_weights
-from avatarjax.data.wardrobe.garments import Piece, grid_faces, one_bone, smoothstep
+from avatarjax.data.wardrobe import drape, fabrics, paths
+from avatarjax.data.wardrobe.bones import head_then_chest, nearest_weights, one_bone
+from avatarjax.data.wardrobe.garments import Piece, grid_faces, outline, smoothstep
+from avatarjax.data.wardrobe.ground import Ground
 from avatarjax.physics.cloth import Fabric
 
 _UP = np.array([0.0, 1.0, 0.0])
 
 
+def hat(rig: Rig, head: Float[np.ndarray, "v 3"], *, base: float, brim: float = 0.085, columns: int = 48) -> Piece:
+    """A cowboy hat on the vertices (v, 3) of a head with its hair, whose band sits at height `base`; rigid on the head.
+
+    `brim` is the width of the brim, metres. u of its uvs runs around, v goes from 0 at the tip to 1 at the brim's edge.
+    """
+    angles = np.arange(columns) * 2 * np.pi / columns
+    slab = head[np.abs(head[:, 1] - base) < 0.02][:, [0, 2]]
+    centre = (slab.min(0) + slab.max(0)) / 2
+    fit = outline(slab, centre, angles) + 0.008
+    fit = (fit + np.roll(fit, 1) + np.roll(fit, -1)) / 3
+    aside = np.sin(angles) ** 2
+    rows = []
+    for share in (1.0, 0.98, 0.8, 0.55, 0.3, 0.1, 0.0):
+        curl = 0.05 * aside * share**2.5 - 0.022 * (1 - aside) * share**1.5
+        rows.append((fit + brim * share, curl + (0.004 if share == 0.98 else 0.0)))
+    for rise, taper in (
+        (0.02, 1.0),
+        (0.05, 0.97),
+        (0.08, 0.93),
+        (0.1, 0.9),
+        (0.116, 0.83),
+        (0.124, 0.7),
+        (0.126, 0.45),
+    ):
+        rows.append((fit * taper, np.full(columns, rise)))
+    rows.append((fit * 0.02, np.full(columns, 0.126)))
+    points = np.zeros((len(rows), columns, 3))
+    for i, (radius, rise) in enumerate(rows):
+        points[i, :, 0] = centre[0] + radius * np.sin(angles)
+        points[i, :, 2] = centre[1] + radius * np.cos(angles)
+        points[i, :, 1] = base + rise
+        # A crease along the top and two dents at its front, as one pinches it.
+        inner = smoothstep(rise, 0.09, 0.124)
+        across, ahead = points[i, :, 0] - centre[0], points[i, :, 2] - centre[1]
+        points[i, :, 1] -= inner * 0.035 * np.exp(-((across / 0.028) ** 2))
+        points[i, :, 1] += inner * 0.012 * ahead / 0.08
+        points[i, :, 0] -= smoothstep(rise, 0.02, 0.1) * 0.22 * across * smoothstep(ahead, 0.0, 0.09)
+    points[..., 1] += 0.1 * (points[..., 2] - centre[1])
+    faces, uvs = grid_faces(len(rows), columns, closed=True)
+    vertices = points.reshape(-1, 3).astype(np.float32)
+    weights = one_bone(rig, "Head", len(vertices))
+    return Piece("hat", vertices, faces, uvs, weights)
+
+
 def hood(
     rig: Rig,
-    lie_on: drape.Ground,
+    lie_on: Ground,
     weights: Float[np.ndarray, "v j"],
     *,
     collar: float,
@@ -71,9 +116,9 @@ def hood(
     points = points + puff[..., None] * normal.reshape(points.shape)
     for _ in range(3):
         points[2:-1] = (points[1:-2] + 2 * points[2:-1] + points[3:]) / 4
-    points = _tidy(np.concatenate([ring[None], points[1:]]), lie_on, 0.01)
+    points = drape.settle(np.concatenate([ring[None], points[1:]]), lie_on, 0.01)
     faces, uvs = grid_faces(rows, columns, closed=False)
-    gone = drape.walked(points)
+    gone = paths.walked(points)
     reach = 1.3 * np.clip(gone - gone[2], 0, None)
     reach[:3] = 0
     vertices = points.reshape(-1, 3).astype(np.float32)
@@ -86,7 +131,7 @@ def hood(
 
 def veil(
     rig: Rig,
-    lie_on: drape.Ground,
+    lie_on: Ground,
     centre: Float[np.ndarray, "3"],
     *,
     length: float,
@@ -106,7 +151,7 @@ def veil(
     turn = np.linspace(-spread, spread, columns)
     up = np.stack([np.sin(turn), np.cos(turn) * np.cos(tilt), -np.cos(turn) * np.sin(tilt)], axis=1)
     band = drape.outward(lie_on.points[lie_on.points[:, 1] > centre[1] - 0.1], centre, up)
-    band = lie_on.clear(drape.even(band, columns) + 0.004 * up, 0.006)
+    band = lie_on.clear(paths.even(band, columns) + 0.004 * up, 0.006)
     torn = 0.5 * np.sin(turn * 9 + 0.6) + 0.35 * np.sin(turn * 17 + 2.1) + 0.35 * np.sin(turn * 23)
     lengths = length - 0.5 * np.abs(centre[1] + 0.12 - band[:, 1]) + tatter * length * (torn - 0.3)
 
@@ -117,93 +162,18 @@ def veil(
         return np.stack([side * 0.35, -np.ones(columns), -back], axis=1)
 
     points = drape.fall(band, lengths, rows, lie_on, pull=pull, gap=gap, ease=3, smooth=0.4)
-    gone = drape.walked(points)
+    gone = paths.walked(points)
     fold = 0.022 * smoothstep(gone, 0.25, 0.7) * (0.5 + 0.5 * np.cos(7.2 * turn + 0.8 * np.sin(2.3 * turn)))
     _, normal = lie_on.height(points.reshape(-1, 3))
     level = normal.reshape(points.shape) * np.array([1.0, 0, 1.0])
     points = points + fold[..., None] * level / np.maximum(np.linalg.norm(level, axis=-1, keepdims=True), 0.3)
     for _ in range(2):
         points[3:-1] = (points[2:-2] + 2 * points[3:-1] + points[4:]) / 4
-    points = _tidy(points, lie_on, 0.8 * gap)
+    points = drape.settle(points, lie_on, 0.8 * gap)
     faces, uvs = grid_faces(rows, columns, closed=False)
     faces, uvs = faces[:, ::-1].copy(), uvs[:, ::-1].copy()
     vertices = points.reshape(-1, 3).astype(np.float32)
     # Pinned to the hair for a hand's breadth behind the band.
     reach = 1.3 * np.clip(gone - 0.06, 0, None)
-    weights = _head_then_chest(rig, vertices)
+    weights = head_then_chest(rig, vertices)
     return Piece("veil", vertices, faces, uvs, weights, reach.ravel().astype(np.float32), fabric=fabric, solid=False)
-
-
-def front_hair(
-    rig: Rig,
-    side: str,
-    lie_on: drape.Ground,
-    centre: Float[np.ndarray, "3"],
-    *,
-    length: float,
-    hairline: float,
-    crown: float,
-    temple: float,
-    gap: float = 0.012,
-    fabric: Fabric = fabrics.HAIR,
-    rows: int = 40,
-    columns: int = 18,
-) -> Piece:
-    """Long hair on one side (Left or Right) of a parting in the middle of the head (around `centre`), which falls to
-    the front of the shoulder.
-
-    The parting runs from `hairline` to `crown`, radians from straight ahead over the top; the hair keeps `temple`
-    metres from the middle of the face; it is `length` metres long.
-    """
-    sign = 1.0 if side == "Left" else -1.0
-    share = np.linspace(0, 1, columns)
-    turn = hairline + (crown - hairline) * share
-    up = np.stack([np.full(columns, 0.012 * sign), np.sin(turn), np.cos(turn)], axis=1)
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
-    head = lie_on.points[lie_on.points[:, 1] > centre[1] - 0.1]
-    roots = lie_on.clear(drape.even(drape.outward(head, centre, up), columns), 0.006)
-
-    def pull(p: np.ndarray, gone: np.ndarray) -> np.ndarray:
-        x = p[:, 0] * sign
-        # Combed away from the parting, then down; in front of the shoulder.
-        edge = temple + 0.035 * share
-        aside = 1.7 * smoothstep(edge - x, -0.01, 0.03) * (gone < 0.25)
-        ahead = 0.75 * smoothstep(gone, 0.14, 0.24) * smoothstep(gone, 0.42, 0.3) * smoothstep(p[:, 2], 0.13, 0.05)
-        inward = -0.3 * smoothstep(gone, 0.2, 0.3) * smoothstep(x - temple - 0.085 * share, 0.0, 0.05)
-        return np.stack([(aside + inward) * sign, -np.ones(columns), ahead], axis=1)
-
-    ragged = 1 + 0.03 * np.sin(share * 12) + 0.015 * np.sin(share * 19 + 1)
-    # The way over the crown is longer than that from the forehead.
-    lengths = length * ragged + 1.2 * (roots[:, 1] - roots[0, 1]) + 0.05 * share
-    points = drape.fall(roots, lengths, rows, lie_on, pull=pull, gap=gap, ease=3, smooth=0.3)
-    for _ in range(2):
-        points[3:-1] = (points[2:-2] + 2 * points[3:-1] + points[4:]) / 4
-    points = _tidy(points, lie_on, 0.8 * gap)
-    gone = drape.walked(points)
-    faces, uvs = grid_faces(rows, columns, closed=False)
-    if side == "Right":
-        faces, uvs = faces[:, ::-1].copy(), uvs[:, ::-1].copy()
-    vertices = points.reshape(-1, 3).astype(np.float32)
-    # On the head it is combed down; what hangs is free.
-    reach = 1.3 * np.clip(gone - 0.15, 0, None)
-    weights = _head_then_chest(rig, vertices)
-    name = side.lower() + " hair"
-    return Piece(name, vertices, faces, uvs, weights, reach.ravel().astype(np.float32), fabric=fabric, solid=False)
-
-
-def _tidy(points: np.ndarray, lie_on: drape.Ground, gap: float) -> np.ndarray:
-    """The sheet (r, n, 3) evenly meshed and, from its fourth row on, `gap` clear of the ground."""
-    gaps = np.repeat(gap * np.minimum(np.arange(len(points)) / 3, 1.0), points.shape[1])
-    for _ in range(3):
-        points = lie_on.clear(points.reshape(-1, 3), gaps).reshape(points.shape)
-        points = drape.even_grid(points, rounds=1)
-    return points
-
-
-def _head_then_chest(rig: Rig, vertices: np.ndarray) -> np.ndarray:
-    """Weights (v, j) on the head, blending to the chest below the chin."""
-    neck = rig.heads[rig.index("Neck"), 1]
-    on_head = smoothstep(vertices[:, 1], neck - 0.06, neck + 0.06)
-    weights = one_bone(rig, "Head", len(vertices)) * on_head[:, None]
-    weights[:, rig.index("Spine2")] += 1 - on_head
-    return weights.astype(np.float32)
