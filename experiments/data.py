@@ -16,6 +16,8 @@ import dataclasses
 import json
 import sys
 import time
+import typing
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -96,7 +98,8 @@ def make(args: Args, name: str) -> dict[str, float]:
         print(f"{name}: the dataset in {folder / 'dataset'} was finished before, reused")
     else:
         print(f"{name}: simulating and drawing into {folder / 'dataset'}")
-        clock.run("dataset", lambda: building.build(folder / "dataset", wanted))
+        resumed = building.unfinished(folder / "dataset", wanted)
+        clock.run("dataset", lambda: building.build(folder / "dataset", wanted), resumed)
     avatar = avatars.build(name)
     clips = _Clips(folder / "dataset")
     numbers = clock.run("measuring", lambda: measure(avatar, clips, wanted))
@@ -120,12 +123,14 @@ class _Clock:
         self.path = path
         self.seconds: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
 
-    def run(self, name: str, work):
+    def run(self, name: str, work: Callable[[], typing.Any], resumed: bool = False) -> typing.Any:
+        before = self.seconds.get(name, 0.0) if resumed else 0.0
         began = time.monotonic()
-        result = work()
-        self.seconds[name] = round(time.monotonic() - began, 1)
-        atomic.write_text(self.path, json.dumps(self.seconds, indent=1))
-        return result
+        try:
+            return work()
+        finally:
+            self.seconds[name] = round(before + time.monotonic() - began, 1)
+            atomic.write_text(self.path, json.dumps(self.seconds, indent=1))
 
 
 class _Clips:

@@ -201,19 +201,28 @@ def build(folder: Path, spec: DatasetSpec, meshes: MeshSequence | None = None, *
     note.unlink()
 
 
+def unfinished(folder: Path, spec: DatasetSpec) -> bool:
+    """Whether a build of this spec was interrupted in `folder`, and `build` would go on with it."""
+    note = folder / _NOTE
+    same = note.is_file() and note.read_text(encoding="utf-8") == _wanted(spec)
+    return same and not (folder / manifest.NAME).exists()
+
+
+def _wanted(spec: DatasetSpec) -> str:
+    return json.dumps({"version": dataset.VERSION, "spec": dataclasses.asdict(spec)})
+
+
 def _begin(folder: Path, spec: DatasetSpec) -> None:
     """Leave in the folder only what an interrupted build of the same spec has finished."""
     folder.mkdir(parents=True, exist_ok=True)
-    note = folder / _NOTE
-    wanted = json.dumps({"version": dataset.VERSION, "spec": dataclasses.asdict(spec)})
-    if (folder / manifest.NAME).exists() or not note.is_file() or note.read_text(encoding="utf-8") != wanted:
+    if not unfinished(folder, spec):
         for name in (manifest.NAME, _NOTE, "avatar.safetensors", "texture.png"):
             (folder / name).unlink(missing_ok=True)
         for name in ("clips", "images"):
             shutil.rmtree(folder / name, ignore_errors=True)
         for path in folder.glob("*.safetensors"):
             path.unlink()
-        atomic.write_text(note, wanted)
+        atomic.write_text(folder / _NOTE, _wanted(spec))
     for path in folder.rglob(".*"):
         path.unlink()  # what a killed process was writing
 

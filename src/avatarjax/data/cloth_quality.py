@@ -14,7 +14,7 @@ _ASIDE = 0.03
 
 def simulated_faces(avatar: AvatarMesh) -> np.ndarray:
     """Which triangles (f,) bool have a vertex that is simulated."""
-    return (avatar.reach[avatar.faces] > 0).any(axis=1)
+    return np.any(avatar.reach[avatar.faces] > 0, axis=1)
 
 
 def penetration(avatar: AvatarMesh, frames: Float[np.ndarray, "f v 3"]) -> Float[np.ndarray, "f p"]:
