@@ -86,7 +86,7 @@ def test_a_second_run_reuses_what_is_finished(finished, capsys):
 
 
 def test_a_damaged_dataset_is_named_with_the_way_out(finished):
-    path = finished / "data" / "truth.safetensors"
+    path = finished / "data" / "clips" / "truth-000.safetensors"
     whole = path.read_bytes()
     path.write_bytes(whole[:-10])
     try:
