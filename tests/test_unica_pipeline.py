@@ -90,7 +90,7 @@ def test_a_damaged_dataset_is_named_with_the_way_out(finished):
     whole = path.read_bytes()
     path.write_bytes(whole[:-10])
     try:
-        with pytest.raises(ValueError, match=r"truth\.safetensors is damaged.*--stage data"):
+        with pytest.raises(ValueError, match=r"truth-000\.safetensors is damaged.*--stage data"):
             experiment.run_experiment(experiment.Args(preset="ci", out=finished.parents[2]))
     finally:
         path.write_bytes(whole)
