@@ -151,12 +151,16 @@ class _Clips:
 def measure(avatar: AvatarMesh, clips: _Clips, wanted: dataset.DatasetSpec) -> dict[str, float]:
     """Penetration and strain of the cloth, foot slide and turning frames, over the training clips."""
     every = max(1, sum(clips.lengths) // MEASURED)
-    depth, strain = [], []
+    parts = cloth_quality.simulated_parts(avatar)
+    depth, strain = [], {part: [] for part in parts}
     for k, length in enumerate(tqdm(clips.lengths, desc="measuring", unit="clip")):
         vertices = clips.vertices(k, np.arange(k % every, length, every))
         depth.append(cloth_quality.penetration(avatar, vertices))
-        strain.append(cloth_quality.strain(avatar, vertices))
-    depths, strains = np.concatenate(depth), np.concatenate(strain)
+        for part in parts:
+            strain[part].append(cloth_quality.strain(avatar, vertices, part).ravel())
+    depths = np.concatenate(depth)
+    by_part = {part: np.concatenate(found) for part, found in strain.items()}
+    strains = np.concatenate(list(by_part.values()))
     scripts = sequences.transition_scripts(wanted.transition_frames, wanted.seed)
     motions = sequences.simulate(avatar, scripts, np.zeros(len(scripts)), [int(s[0]) for s in scripts], wanted.seed)
     slides = np.concatenate([foot_slide.foot_slide(avatar.rig, m.transforms[sequences.LEAD_IN :]) for m in motions])
@@ -169,6 +173,7 @@ def measure(avatar: AvatarMesh, clips: _Clips, wanted: dataset.DatasetSpec) -> d
         "deepest mm": 1e3 * float(depths.max()),
         "strain 99th percentile": float(np.percentile(strains, 99)),
         "strain median": float(np.median(strains)),
+        **{f"strain 99th percentile, {part}": float(np.percentile(s, 99)) for part, s in by_part.items()},
         "foot slide median mm a step": 1e3 * float(np.median(slides)),
         "foot slide 90th percentile mm a step": 1e3 * float(np.percentile(slides, 90)),
         "frames of a 180 degree turn": turns[180],

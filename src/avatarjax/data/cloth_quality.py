@@ -43,9 +43,18 @@ def penetration(avatar: AvatarMesh, frames: Float[np.ndarray, "f v 3"]) -> Float
     return np.stack(depths).astype(np.float32)
 
 
-def strain(avatar: AvatarMesh, frames: Float[np.ndarray, "f v 3"]) -> Float[np.ndarray, "f e"]:
-    """Relative change |l / l0 - 1| of the length of every edge of the cloth against the rest pose, frame by frame."""
-    faces = avatar.faces[simulated_faces(avatar)]
+def simulated_parts(avatar: AvatarMesh) -> tuple[str, ...]:
+    """The names of the parts that have simulated vertices."""
+    return tuple(avatar.part_names[k] for k in np.unique(avatar.parts[simulated_faces(avatar)]))
+
+
+def strain(avatar: AvatarMesh, frames: Float[np.ndarray, "f v 3"], part: str | None = None) -> Float[np.ndarray, "f e"]:
+    """Relative change |l / l0 - 1| of the length of every edge of the cloth, or of one `part` of it, against the rest
+    pose, frame by frame."""
+    chosen = simulated_faces(avatar)
+    if part is not None:
+        chosen &= avatar.parts == avatar.part_names.index(part)
+    faces = avatar.faces[chosen]
     edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
     edges = edges[(avatar.reach[edges] > 0).any(axis=1)]
 
