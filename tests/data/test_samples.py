@@ -11,6 +11,7 @@ import pytest
 from avatarjax import posmap
 from avatarjax.data import dataset, samples, sequences
 from avatarjax.io import exr, weights
+from avatarjax.posmap import groups as public_groups
 
 SOURCES = [samples.FrameSource, samples.GroupSource, samples.ImageSource]
 CLIP_FRAMES = 60
@@ -261,3 +262,13 @@ class TestLoader:
         for k in range(3):
             place = int(batch["sequence"][k]) * (CLIP_FRAMES - 3) + int(batch["frame"][k]) - 2
             np.testing.assert_array_equal(batch["posmaps"][k], groups[place]["posmaps"])
+
+
+def test_groups_are_written_in_the_public_layout(tiny_folder, tmp_path):
+    source = samples.GroupSource(tiny_folder, check=False)
+    (folder,) = samples.write_groups(source, tmp_path, [3])
+    maps, mask = public_groups.from_public(public_groups.read_group(folder))
+    np.testing.assert_array_equal(mask[0], source[3]["mask"])
+    np.testing.assert_allclose(maps, source[3]["posmaps"], atol=1e-6)
+    _, frame, action = public_groups.parse_group_name(folder.name)
+    assert frame == source[3]["frame"] and action.lower() == source.actions[int(source[3]["action"])]

@@ -141,8 +141,8 @@ def load(folder: Path) -> Dataset:
 
 def load_take(folder: Path, split: str, k: int) -> Take:
     """One sequence of a split, without its vertices."""
-    arrays = weights.load_arrays(clip_path(folder, split, k))[0]
-    return Take(**{f.name: arrays[f.name] for f in dataclasses.fields(Take)})
+    names = [field.name for field in dataclasses.fields(Take)]
+    return Take(**weights.load_arrays(clip_path(folder, split, k), names)[0])
 
 
 def fingerprint(folder: Path) -> str:

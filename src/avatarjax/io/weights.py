@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import os
 import typing
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
 from avatarjax.io import atomic
@@ -35,13 +36,22 @@ def save_tree(path: str | os.PathLike, tree: PyTree, **metadata: typing.Any) -> 
         save_file(arrays, str(temporary), metadata={"avatarjax": json.dumps(metadata)})
 
 
-def load_arrays(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, typing.Any]]:
-    """All arrays of a file by name, and its metadata. Raises ValueError that names a missing or corrupt file."""
+def load_arrays(
+    path: str | os.PathLike, names: Iterable[str] | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, typing.Any]]:
+    """All arrays of a file by name, or only those in `names`, and its metadata.
+
+    Raises ValueError that names a missing or corrupt file, or one that lacks an array.
+    """
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path} does not exist")
     try:
-        arrays = load_file(str(path))
+        if names is None:
+            arrays = load_file(str(path))
+        else:
+            with safe_open(str(path), framework="numpy") as file:
+                arrays = {name: file.get_tensor(name) for name in names}
         with path.open("rb") as f:
             header = json.loads(f.read(int.from_bytes(f.read(8), "little")))
     except (SafetensorError, ValueError) as error:
