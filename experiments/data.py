@@ -27,13 +27,13 @@ from tqdm import tqdm
 
 from avatarjax import cameras
 from avatarjax.cameras import Camera
-from avatarjax.data import avatars, building, capture, cloth_quality, dataset, sequences
+from avatarjax.data import avatars, building, capture, cloth_quality, dataset, sequences, skinning
 from avatarjax.data.mesh_renderer import MeshRenderer
-from avatarjax.data.motion import foot_slide, performances
+from avatarjax.data.motion import performances
 from avatarjax.data.motion.locomotion import LocomotionConfig
 from avatarjax.data.wardrobe.assembly import AvatarMesh
 from avatarjax.io import atomic, exr, video, weights
-from avatarjax.metrics import responsiveness
+from avatarjax.metrics import foot_slide, responsiveness
 from avatarjax.metrics.report import Report
 from avatarjax.physics.xpbd import XPBDConfig
 
@@ -163,7 +163,8 @@ def measure(avatar: AvatarMesh, clips: _Clips, wanted: dataset.DatasetSpec) -> d
     strains = np.concatenate(list(by_part.values()))
     scripts = sequences.transition_scripts(wanted.transition_frames, wanted.seed)
     motions = sequences.simulate(avatar, scripts, np.zeros(len(scripts)), [int(s[0]) for s in scripts], wanted.seed)
-    slides = np.concatenate([foot_slide.foot_slide(avatar.rig, m.transforms[sequences.LEAD_IN :]) for m in motions])
+    feet = [skinning.feet(avatar.rig, m.transforms[sequences.LEAD_IN :]) for m in motions]
+    slides = np.concatenate([foot_slide.foot_slides(f.toes, f.balls) for f in feet])
     turns = turning(motions, scripts)
     return {
         "frames": float(sum(clips.lengths)),
@@ -258,7 +259,8 @@ def film(
             size = max(128, wanted.image_size)
             vertices = capture.film(folder, avatar, motion, size=size, config=config, progress=bar.update)
     depth = cloth_quality.penetration(avatar, vertices[::8])
-    slides = foot_slide.foot_slide(avatar.rig, motion.transforms)
+    feet = skinning.feet(avatar.rig, motion.transforms)
+    slides = foot_slide.foot_slides(feet.toes, feet.balls)
     return {
         "frames": float(len(vertices)),
         "under 5 mm deep": float((depth <= 0.005).mean()),

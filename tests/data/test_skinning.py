@@ -76,3 +76,28 @@ def test_gradients_are_finite_at_the_rest_pose(figure):
         return jnp.sum((skinning.skin(basis, transforms) - vertices + 0.01) ** 2)
 
     assert np.isfinite(jax.jit(jax.grad(loss))(identity(rig))).all()
+
+
+def test_the_joints_of_a_recorded_motion_are_those_of_each_frame(figure):
+    _, rig, _ = figure
+    rng = np.random.default_rng(3)
+    quats = rng.normal(size=(4, len(rig.names), 4)).astype(np.float32)
+    quats /= np.linalg.norm(quats, axis=-1, keepdims=True)
+    hips = rng.normal(size=(4, 3)).astype(np.float32)
+    paths = skinning.joint_paths(rig, quats, hips)
+    np.testing.assert_allclose(paths[:, rig.index("Hips")], hips, atol=1e-6)
+    for k in range(4):
+        expected = skinning.joint_positions(rig, KINEMATICS(rig, quats[k], hips[k]))
+        np.testing.assert_allclose(paths[k], expected, atol=1e-5)
+
+
+def test_feet_are_soles_and_balls_of_every_frame(figure):
+    _, rig, _ = figure
+    transforms = jnp.stack([KINEMATICS(rig, identity(rig), jnp.array([0.0, h, 0.0])) for h in (0.0, 1.0)])
+    feet = skinning.feet(rig, transforms)
+    for k in range(2):
+        np.testing.assert_allclose(feet.soles[k], skinning.sole_points(rig, transforms[k]), atol=1e-6)
+    np.testing.assert_allclose(feet.balls[1] - feet.balls[0], [[0, 1, 0]] * 2, atol=1e-6)
+    assert (feet.balls[:, 0, 0] > 0).all() and (feet.balls[:, 1, 0] < 0).all()
+    toes = feet.toes
+    assert toes.shape[2] == feet.soles.shape[2] // 2 and toes[..., 2].mean() > feet.soles[..., 2].mean()

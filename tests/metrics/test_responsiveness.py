@@ -50,6 +50,24 @@ class TestTurnFrames:
         assert responsiveness.turn_frames(self.turning(5, after=5), 10, np.pi / 2, hold=5) == 4
 
 
+class TestTransitionFrames:
+    def test_the_wait_before_the_turn_does_not_count(self):
+        waiting = np.array([0.0] * 17 + list(np.deg2rad([15, 30, 45, 60, 75])) + [np.pi / 2] * 20)
+        assert responsiveness.turn_frames(waiting, 10, np.pi / 2) == 12
+        assert responsiveness.transition_frames(waiting, 10, 0.0, np.pi / 2) == 5
+
+    def test_a_turn_that_starts_at_once_takes_as_long_either_way(self):
+        turn = np.array([0.0] * 10 + [0.5, 1.0] + [np.pi / 2] * 20)
+        assert responsiveness.transition_frames(turn, 10, 0.0, np.pi / 2) == 2
+        assert responsiveness.turn_frames(turn, 10, np.pi / 2) == 2
+
+    def test_an_instant_turn_after_a_wait_takes_none(self):
+        assert responsiveness.transition_frames(np.array([0.0] * 15 + [np.pi] * 20), 10, 0.0, np.pi) == 0
+
+    def test_one_that_never_settles_has_none(self):
+        assert responsiveness.transition_frames(np.zeros(40), 10, 0.0, np.pi) is None
+
+
 @pytest.fixture(scope="module")
 def obedient():
     """Idle, W, S with a slow half turn, then A at once."""
@@ -77,6 +95,9 @@ class TestResponses:
     def test_turn_frames_are_counted_from_the_key(self, obedient):
         assert [r["turn_frames"] for r in obedient[1:]] == [0, 5, 0]
 
+    def test_a_turn_has_transition_frames_and_a_start_has_none(self, obedient):
+        assert [r["transition_frames"] for r in obedient[1:]] == [None, 5, 0]
+
     def test_a_constant_wrong_heading_is_its_error(self):
         records = responsiveness.responses(path([np.deg2rad(30)] * 60)[:-1], np.full(60, 1), YAW, MOVES)
         assert records[0]["heading_error"] == pytest.approx(30)
@@ -91,3 +112,13 @@ class TestResponses:
     def test_a_key_pressed_at_the_last_frame_has_a_finite_speed(self):
         records = responsiveness.responses(path([0.0] * 30), np.array([1] * 30 + [2]), YAW, MOVES)
         assert np.isfinite(records[-1]["speed"])
+
+    def test_roots_that_are_not_finite_are_refused(self):
+        roots = path([0.0] * 30)
+        roots[4, 1] = np.nan
+        with pytest.raises(ValueError, match=r"roots must be finite.*\(4, 1\)"):
+            responsiveness.responses(roots, np.ones(31, int), YAW, MOVES)
+
+    def test_an_action_that_there_is_not_is_refused(self):
+        with pytest.raises(ValueError, match="actions must be 0 to 4, got 1 to 5"):
+            responsiveness.responses(path([0.0] * 30), np.array([1] * 30 + [5]), YAW, MOVES)

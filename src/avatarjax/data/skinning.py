@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import typing
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -72,3 +75,37 @@ def sole_points(rig: Rig, transforms: Float[Array, "j 3 4"]) -> Float[Array, "2 
     ]
     moves = transforms[np.array(bones)]
     return jnp.einsum("fsab,fsb->fsa", moves[..., :3], soles) + moves[..., 3]
+
+
+@jax.jit
+def joint_paths(
+    rig: Rig, local_quats: Float[Array | np.ndarray, "f j 4"], hips: Float[Array | np.ndarray, "f 3"]
+) -> Float[Array, "f j 3"]:
+    """World positions (f, j, 3) of the joints of a recorded motion, such as a `Take`'s quats and hips, metres."""
+    transforms = jax.vmap(forward_kinematics, in_axes=(None, 0, 0))(rig, jnp.asarray(local_quats), jnp.asarray(hips))
+    return jax.vmap(joint_positions, in_axes=(None, 0))(rig, transforms)
+
+
+class Feet(typing.NamedTuple):
+    """Both feet, left and right, of f frames in the world, metres: points under them (f, 2, s, 3), of which the second
+    half are under the toes, and the balls (f, 2, 3), the joints at the base of the toes."""
+
+    soles: Float[np.ndarray, "f 2 s 3"]
+    balls: Float[np.ndarray, "f 2 3"]
+
+    @property
+    def toes(self) -> Float[np.ndarray, "f 2 p 3"]:
+        """The points under the toes."""
+        return self.soles[:, :, self.soles.shape[2] // 2 :]
+
+
+def feet(rig: Rig, transforms: Float[Array | np.ndarray, "f j 3 4"]) -> Feet:
+    """Where the feet are in a motion of bone transforms: what foot slide is measured on (`metrics.foot_slide`)."""
+    soles, joints = _feet(rig, jnp.asarray(transforms))
+    return Feet(np.asarray(soles), np.asarray(joints)[:, [rig.index(s + "ToeBase") for s in ("Left", "Right")]])
+
+
+@jax.jit
+def _feet(rig: Rig, transforms: Array) -> tuple[Array, Array]:
+    soles = jax.vmap(sole_points, in_axes=(None, 0))(rig, transforms)
+    return soles, jax.vmap(joint_positions, in_axes=(None, 0))(rig, transforms)
