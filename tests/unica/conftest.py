@@ -89,7 +89,7 @@ def coefficient_dynamics(tiny_data, coefficient_frames):
     basis = fit_basis(jnp.asarray(flat), TINY.coefficients.components, jax.random.key(1))
     poses = np.asarray(pcs.project(basis, jnp.asarray(flat)))
     return CoefficientDynamics(
-        params=random_params(CoefficientDenoiser, TINY.coefficients, scale=0.05),
+        params=random_params(CoefficientDenoiser, TINY.coefficients, scale=0.1),
         basis=basis,
         scaling=fit.coefficient_scaling(poses, roots, tiny_data.train.sequence),
         action_yaw=jnp.asarray([0.0, 0.0, np.pi, np.pi / 2, -np.pi / 2], jnp.float32),

@@ -28,10 +28,14 @@ def ssim(a: Float[Array, "h w c"], b: Float[Array, "h w c"]) -> Float[Array, ""]
     """
     if min(a.shape[:2]) < _WINDOW:
         raise ValueError(f"ssim needs images of at least {_WINDOW}x{_WINDOW} pixels, got {a.shape[0]}x{a.shape[1]}")
+    # Variances about the images' own means: as differences of raw moments float32 would lose them in flat places.
+    centre_a, centre_b = (jax.lax.stop_gradient(jnp.mean(x, axis=(0, 1), keepdims=True)) for x in (a, b))
+    a, b = a - centre_a, b - centre_b
     means = _blur(jnp.concatenate([a, b, a * a, b * b, a * b], axis=-1))
     mean_a, mean_b, mean_aa, mean_bb, mean_ab = jnp.split(means, 5, axis=-1)
+    variances, covariance = mean_aa + mean_bb - mean_a * mean_a - mean_b * mean_b, mean_ab - mean_a * mean_b
+    mean_a, mean_b = mean_a + centre_a, mean_b + centre_b
     product, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
-    variances, covariance = mean_aa + mean_bb - squares, mean_ab - product
     similarity = (2 * product + _C1) * (2 * covariance + _C2) / ((squares + _C1) * (variances + _C2))
     return jnp.mean(similarity)
 
