@@ -97,6 +97,11 @@ def test_clips_outside_the_video_are_refused(starts):
         fvd.features(1.0, numbered(1, 40), np.array(starts, int), network=mean_colours, progress=False)
 
 
+def test_a_batch_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="batch"):
+        fvd.features(1.0, numbered(1, 16), network=mean_colours, batch=0, progress=False)
+
+
 def test_features_that_are_not_finite_are_refused():
     with pytest.raises(ValueError, match="not finite"):
         fvd.features(np.nan, numbered(1, 16), network=mean_colours, progress=False)

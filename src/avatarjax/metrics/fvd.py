@@ -39,8 +39,9 @@ class FVD(typing.NamedTuple):
     `per_view` (v,); `generated_clips` and `reference_clips` count a view's. `low` and `high` bound the pooled value by
     a normal 95 % interval, its variance from the jackknife that leaves out one time window at a time, in all views
     because they show the same motion, first of the one side, then of the other. The interval tells how much other
-    motions of this length would change the number, not how far the bias of few clips has raised it. The bounds are NaN
-    where leaving out a window leaves fewer than two clips.
+    motions of this length would change the number, not how far the bias of few clips has raised it. It takes the two
+    sides for independent: of videos that follow each other frame by frame it is too wide. The bounds are NaN where
+    leaving out a window leaves fewer than two clips.
     """
 
     per_view: tuple[float, ...]
@@ -125,7 +126,10 @@ def features(
     starts = every if starts is None else np.asarray(starts)
     if len(starts) == 0 or starts.min() < 0 or starts.max() > videos.shape[1] - CLIP:
         raise ValueError(f"clips must begin between frames 0 and {videos.shape[1] - CLIP}, got {starts}")
-    batch = batch or (1 if jax.default_backend() == "cpu" else BATCH)
+    if batch is None:
+        batch = 1 if jax.default_backend() == "cpu" else BATCH
+    if batch < 1:
+        raise ValueError(f"batch must be at least 1, got {batch}")
     network, params = jax.jit(network), jax.device_put(params)
     clips = [(view, start) for view in range(len(videos)) for start in starts]
     rows = []

@@ -24,6 +24,8 @@ _UNITS = {"1a": "Conv3d_1a_7x7", "2b": "Conv3d_2b_1x1", "2c": "Conv3d_2c_3x3"}
 _MIXED = ("3b", "3c", "4b", "4c", "4d", "4e", "4f", "5b", "5c")
 _POOLED_BEFORE = {"4b": ((3, 3, 3), (2, 2, 2)), "5b": ((2, 2, 2), (2, 2, 2))}
 _EPSILON = 1e-3
+# By default GPUs round the factors of products to ten bits.
+_PRECISION = lax.Precision.HIGHEST
 
 
 def load() -> dict[str, typing.Any]:
@@ -70,7 +72,7 @@ def logits(params: dict[str, typing.Any], clips: Float[Array, "b t h w 3"]) -> F
     x = jnp.mean(x, axis=(2, 3))
     # Two frames at a time, then all: frames at the ends count half.
     x = jnp.mean((x[:, :-1] + x[:, 1:]) / 2, axis=1)
-    return x @ params["logits"]["kernel"][0, 0] + params["logits"]["bias"][None]
+    return jnp.matmul(x, params["logits"]["kernel"][0, 0], precision=_PRECISION) + params["logits"]["bias"][None]
 
 
 def frames_to_channels(kernel: Float[np.ndarray, "t h w i o"]) -> Float[np.ndarray, "h w j o"]:
@@ -97,6 +99,7 @@ def conv(
         (stride, stride),
         "SAME",
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=_PRECISION,
     )
     return out.reshape(b, frames, *out.shape[1:])
 
@@ -134,7 +137,10 @@ def _mixed(params: dict[str, typing.Any], x: Float[Array, "b t h w i"]) -> Float
 
 def _relu_unit(params: dict[str, typing.Any], x: Array, *, taps: int = 1, stride: int = 1) -> Array:
     kernel = params["kernel"]
-    x = x @ kernel[0, 0] if kernel.shape[:2] == (1, 1) else conv(x, kernel, taps=taps, stride=stride)
+    if kernel.shape[:2] == (1, 1):
+        x = jnp.matmul(x, kernel[0, 0], precision=_PRECISION)
+    else:
+        x = conv(x, kernel, taps=taps, stride=stride)
     return jnp.maximum(x + params["bias"].reshape(1, 1, 1, 1, -1), 0)
 
 
