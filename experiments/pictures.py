@@ -140,15 +140,16 @@ def plot_paths(path: Path, paths: dict[str, np.ndarray]) -> None:
     save_plot(path, draw, size=(6, 6))
 
 
-def plot_lines(path: Path, lines: dict[str, np.ndarray], xlabel: str, ylabel: str, *, logy: bool = False) -> None:
+def draw_lines(axes: typing.Any, lines: dict[str, np.ndarray], xlabel: str, ylabel: str, *, logy: bool = False) -> None:
     """Several curves over their index or, for (n, 2) arrays, over their first column."""
+    for label, line in lines.items():
+        x, y = (line[:, 0], line[:, 1]) if line.ndim == 2 else (np.arange(len(line)), line)
+        axes.plot(x, y, label=label, lw=1.4, marker="o" if line.ndim == 2 else None, ms=3)
+    axes.set(xlabel=xlabel, ylabel=ylabel, yscale="log" if logy else "linear")
+    axes.grid(alpha=0.3)
+    axes.legend()
 
-    def draw(axes):
-        for label, line in lines.items():
-            x, y = (line[:, 0], line[:, 1]) if line.ndim == 2 else (np.arange(len(line)), line)
-            axes.plot(x, y, label=label, lw=1.4, marker="o" if line.ndim == 2 else None, ms=3)
-        axes.set(xlabel=xlabel, ylabel=ylabel, yscale="log" if logy else "linear")
-        axes.grid(alpha=0.3)
-        axes.legend()
 
-    save_plot(path, draw)
+def plot_lines(path: Path, lines: dict[str, np.ndarray], xlabel: str, ylabel: str) -> None:
+    """A picture of `draw_lines`."""
+    save_plot(path, lambda axes: draw_lines(axes, lines, xlabel, ylabel))

@@ -67,7 +67,18 @@ def test_the_trained_avatar_loads_and_rolls_out(finished, dynamics):
 
 def test_the_report_names_every_stage_and_embeds_its_pictures(finished):
     page = (finished / "report.html").read_text()
-    for text in ("Does it obey?", "against copy last", "autoencoder", "PCA with", "appearance network", "What is poor"):
+    for text in (
+        "Does it obey?",
+        "against copy last",
+        "autoencoder",
+        "Alignment error",
+        "Frames of turning",
+        "Motion error",
+        "Foot slide",
+        "jaxlib",
+        "appearance network",
+        "What is poor",
+    ):
         assert text in page
     assert page.count("data:image/png;base64") >= 8
     assert page.count("data:video/mp4;base64") == 1

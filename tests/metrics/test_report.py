@@ -188,7 +188,7 @@ def test_a_comparison_says_where_the_papers_number_is_from(tmp_path):
     assert page.cells == ["turning", "14 [12, 16]", "5", "9.84", "UNICA Table D and D.4"]
 
 
-def test_plots_keep_their_text_and_follow_the_pages_colour(tmp_path):
+def test_plots_keep_their_text_and_follow_the_pages_colour(tmp_path, caplog):
     def draw(axes):
         x = np.arange(4.0)
         draw_band(axes, x, x, x - 1, x + 1, "trend")
@@ -200,6 +200,7 @@ def test_plots_keep_their_text_and_follow_the_pages_colour(tmp_path):
     page = written(report, tmp_path)
     assert {"trend", "frame < 4", "caption"} <= set(page.words)
     text = (tmp_path / "report.html").read_text()
+    assert not caplog.records
     assert "currentColor" in text and "#000000" not in text and "<?xml" not in text
 
 

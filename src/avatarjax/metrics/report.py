@@ -36,18 +36,18 @@ nav ul { list-style: none; display: flex; flex-wrap: wrap; gap: .3em 1.3em; marg
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .94em }
 caption { text-align: left; color: var(--soft); padding-bottom: .5em; max-width: 70em }
 th, td { padding: .35em .9em; border-bottom: 1px solid var(--line); text-align: right }
-th:first-child, td:first-child { text-align: left } th { background: var(--card); font-weight: 600 }
+td { white-space: nowrap } th:first-child, td:first-child { text-align: left; white-space: normal; min-width: 7em }
+table { min-width: min(100%, 34em) } th { background: var(--card); font-weight: 600 }
 tr.good td:last-child { color: var(--good) } tr.bad td:last-child { color: var(--bad) }
 figure { margin: 1.4em 0 } figcaption { color: var(--soft); font-size: .92em; margin-top: .4em }
 img, video, figure svg { max-width: 100%; height: auto; border-radius: 6px } img, video { background: #fff }
-figure svg text { fill: currentColor }
+video { min-width: min(100%, 40em) } figure svg text { fill: currentColor; font-family: inherit !important }
 pre { background: var(--card); padding: .9em 1.1em; overflow-x: auto; border-radius: 8px; font-size: .88em }
 """
 _MEDIA = {".png": "image/png", ".mp4": "video/mp4"}
 _PLOT = {
     "svg.fonttype": "none",
     "font.size": 11,
-    "font.sans-serif": ["system-ui", "sans-serif"],
     "legend.frameon": False,
     "axes.spines.top": False,
     "axes.spines.right": False,

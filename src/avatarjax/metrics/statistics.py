@@ -55,8 +55,9 @@ def bootstrap(values: typing.Any, groups: typing.Any = None, *, confidence: floa
     Independent values are resampled one by one (bias-corrected and accelerated, Efron 1987). With `groups`, one label
     a value, whole groups are resampled instead and the interval is that of expanded percentiles (cluster bootstrap,
     Field and Welsh 2007; `expanded_tails`): frames of one sequence are correlated, and counting them as independent
-    makes an interval too narrow. Equal values have an interval of no width; of one value or
-    one group nothing is known, and the bounds are NaN. The same seed gives the same bounds.
+    makes an interval too narrow. That of fewer than about ten single values is too narrow as well. Equal values have
+    an interval of no width; of one value or one group nothing is known, and the bounds are NaN. The same seed gives
+    the same bounds.
 
     Raises ValueError for no values, values that are not finite, labels of another number, or a confidence outside
     (0, 1).
