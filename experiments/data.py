@@ -33,8 +33,9 @@ from avatarjax.data.motion import performances
 from avatarjax.data.motion.locomotion import LocomotionConfig
 from avatarjax.data.wardrobe.assembly import AvatarMesh
 from avatarjax.io import atomic, exr, video, weights
-from avatarjax.metrics import foot_slide, responsiveness
+from avatarjax.metrics import foot_slide, published, responsiveness
 from avatarjax.metrics.report import Report
+from avatarjax.metrics.statistics import Estimate, bootstrap
 from avatarjax.physics.xpbd import XPBDConfig
 
 SCRIPT = (1,) * 30 + (2,) * 30 + (3,) * 30 + (0,) * 30
@@ -102,7 +103,7 @@ def make(args: Args, name: str) -> dict[str, float]:
         clock.run("dataset", lambda: building.build(folder / "dataset", wanted), resumed)
     avatar = avatars.build(name)
     clips = _Clips(folder / "dataset")
-    numbers = clock.run("measuring", lambda: measure(avatar, clips, wanted))
+    numbers, means = clock.run("measuring", lambda: measure(avatar, clips, wanted))
     size = sum(p.stat().st_size for p in (folder / "dataset").rglob("*") if p.is_file())
     numbers |= {"dataset megabytes": size / 1e6, "dataset minutes": clock.seconds.get("dataset", 0.0) / 60}
     clock.run("pictures", lambda: show(avatar, clips, folder))
@@ -110,8 +111,9 @@ def make(args: Args, name: str) -> dict[str, float]:
     if args.performances:
         for motion in performances.NAMES:
             films[motion] = clock.run(motion, lambda m=motion: film(avatar, m, args, wanted, folder / "monocular" / m))
-    atomic.write_text(folder / "quality.json", json.dumps(numbers | {"performances": films}, indent=1))
-    write_report(folder, name, args, clips, numbers, films)
+    found = numbers | {"means": {what: mean._asdict() for what, mean in means.items()}, "performances": films}
+    atomic.write_text(folder / "quality.json", json.dumps(found, indent=1))
+    write_report(folder, name, args, numbers, means, films, clock.seconds)
     print(f"{name}: open {folder / 'report.html'}")
     return numbers
 
@@ -148,25 +150,37 @@ class _Clips:
         return clip["vertices"][frames].astype(np.float32) + clip["roots"][frames, None]
 
 
-def measure(avatar: AvatarMesh, clips: _Clips, wanted: dataset.DatasetSpec) -> dict[str, float]:
-    """Penetration and strain of the cloth, foot slide and turning frames, over the training clips."""
+def measure(
+    avatar: AvatarMesh, clips: _Clips, wanted: dataset.DatasetSpec
+) -> tuple[dict[str, float], dict[str, Estimate]]:
+    """Penetration and strain of the cloth, foot slide and turning frames, over the training clips; of those that have
+    many values a clip, the means with intervals over clips."""
     every = max(1, sum(clips.lengths) // MEASURED)
     parts = cloth_quality.simulated_parts(avatar)
     depth, strain = [], {part: [] for part in parts}
+    clip_strain = []
     for k, length in enumerate(tqdm(clips.lengths, desc="measuring", unit="clip")):
         vertices = clips.vertices(k, np.arange(k % every, length, every))
         depth.append(cloth_quality.penetration(avatar, vertices))
         for part in parts:
             strain[part].append(cloth_quality.strain(avatar, vertices, part).ravel())
+        clip_strain.append(np.mean(np.concatenate([found[-1] for found in strain.values()])))
     depths = np.concatenate(depth)
     by_part = {part: np.concatenate(found) for part, found in strain.items()}
     strains = np.concatenate(list(by_part.values()))
     scripts = sequences.transition_scripts(wanted.transition_frames, wanted.seed)
     motions = sequences.simulate(avatar, scripts, np.zeros(len(scripts)), [int(s[0]) for s in scripts], wanted.seed)
     feet = [skinning.feet(avatar.rig, m.transforms[sequences.LEAD_IN :]) for m in motions]
-    slides = np.concatenate([foot_slide.foot_slides(f.toes, f.balls) for f in feet])
+    each = [foot_slide.foot_slides(f.toes, f.balls) for f in feet]
+    slides, clip = np.concatenate(each), np.repeat(np.arange(len(each)), [len(s) for s in each])
     turns = turning(motions, scripts)
-    return {
+    means = {
+        "share of vertex-frames under 5 mm deep, mean of the clips": bootstrap([(d <= 0.005).mean() for d in depth]),
+        "strain, mean of the clips": bootstrap(clip_strain),
+        "foot slide, mm a step": bootstrap(1e3 * slides, clip),
+        **{f"frames of a {angle} degree turn": bootstrap(frames) for angle, frames in turns.items() if frames},
+    }
+    numbers = {
         "frames": float(sum(clips.lengths)),
         "vertices": float(len(avatar.vertices)),
         "simulated vertices": float((avatar.reach > 0).sum()),
@@ -177,13 +191,14 @@ def measure(avatar: AvatarMesh, clips: _Clips, wanted: dataset.DatasetSpec) -> d
         **{f"strain 99th percentile, {part}": float(np.percentile(s, 99)) for part, s in by_part.items()},
         "foot slide median mm a step": 1e3 * float(np.median(slides)),
         "foot slide 90th percentile mm a step": 1e3 * float(np.percentile(slides, 90)),
-        "frames of a 180 degree turn": turns[180],
-        "frames of a 90 degree turn": turns[90],
+        **{f"frames of a {angle} degree turn": float(np.median(frames)) for angle, frames in turns.items() if frames},
     }
+    return numbers, means
 
 
-def turning(motions, scripts) -> dict[int, float]:
-    """Median frames until the ground root's movement stays within 12 degrees of the new direction for 8 frames."""
+def turning(motions, scripts) -> dict[int, list[int]]:
+    """Frames of every turn, by its angle: until the ground root's movement stays within 12 degrees of the new direction
+    for 8 frames."""
     yaw = LocomotionConfig().directions
     found: dict[int, list[int]] = {180: [], 90: []}
     for motion, script in zip(motions, scripts, strict=True):
@@ -195,7 +210,7 @@ def turning(motions, scripts) -> dict[int, float]:
             frames = responsiveness.turn_frames(directions, int((script == source).sum()), wanted)
             if frames is not None:
                 found[angle].append(frames)
-    return {angle: float(np.median(frames)) for angle, frames in found.items()}
+    return found
 
 
 def four_cameras(size: int) -> Camera:
@@ -270,10 +285,17 @@ def film(
     }
 
 
-def write_report(folder: Path, name: str, args: Args, clips: _Clips, numbers: dict, films: dict) -> None:
+def write_report(
+    folder: Path,
+    name: str,
+    args: Args,
+    numbers: dict[str, float],
+    means: dict[str, Estimate],
+    films: dict,
+    seconds: dict[str, float],
+) -> None:
     """One page with the pictures and the numbers beside their goals."""
     report = Report(f"{name}: training data, preset {args.preset}")
-    report.code(f"python -m experiments.data --avatar {name} --preset {args.preset} --seed {args.seed}")
     report.media(
         folder / "contact_sheet.png", "Six moments of the training clips from four sides, drawn by ray casting"
     )
@@ -301,10 +323,20 @@ def write_report(folder: Path, name: str, args: Args, clips: _Clips, numbers: di
         "Foot slide is the way of the ball of a foot in one contact. A turn has ended when the movement of the ground "
         "root stays within 12 degrees of the new direction for 8 frames."
     )
+    turn = {f"frames of a {angle} degree turn": f"{angle} degrees" for angle in (180, 90)}
+    report.table(
+        "Means with 95 % bootstrap intervals, of steps over clips", ("what", "mean"), [(k, v) for k, v in means.items()]
+    )
+    report.comparison(
+        "Turns of the controller's ground root, beside the paper's ground truth",
+        [(k, means[k], published.UNICA_D_TURNS.at("ground truth", turn[k])) for k in turn if k in means],
+    )
     if films:
         report.heading("Performances for SMAD")
         columns = ("performance", *next(iter(films.values())))
         report.table("Filmed by one camera", columns, [(k, *v.values()) for k, v in films.items()])
+    command = f"python -m experiments.data --avatar {name} --preset {args.preset} --seed {args.seed}"
+    report.environment(command + (" --performances" if args.performances else ""), seconds)
     report.write(folder / "report.html")
 
 

@@ -35,6 +35,8 @@ def test_the_numbers_are_measured(run):
     assert numbers["share of vertex-frames under 5 mm deep"] > 0.99
     assert 0 < numbers["strain median"] < numbers["strain 99th percentile"] < 2
     assert numbers["foot slide median mm a step"] < 10
+    assert numbers["means"]["frames of a 90 degree turn"]["n"] == 8
+    assert numbers["means"]["foot slide, mm a step"]["groups"] == 20
     assert (numbers["frames of a 180 degree turn"], numbers["frames of a 90 degree turn"]) == (12, 9)
 
 
@@ -46,6 +48,8 @@ def test_the_report_has_the_pictures_in_it(run):
     page = (run / "report.html").read_text()
     assert page.count("data:image/png;base64") == 1 and page.count("data:video/mp4;base64") == 1
     assert "at least 0.999" in page
+    for text in ("jaxlib", "--avatar cowgirl --preset ci --seed 0", "foot slide, mm a step", "UNICA Table D and D.4"):
+        assert text in page
 
 
 @pytest.mark.parametrize("arguments, said", [(("cow", "ci"), "monk, cowgirl"), (("monk", "huge"), "ci, small, paper")])
