@@ -1,6 +1,7 @@
 """Rollouts from true frames: they start where the recording is, and answer its keys."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,8 +12,8 @@ from avatarjax.unica.rollout import reset, rollout
 
 def test_three_standing_frames_are_the_reset_state(avatar, key):
     root = np.asarray(posmap.root(avatar.atlas, avatar.standing))
-    texels = np.broadcast_to(avatar.standing - root, (3, *avatar.standing.shape))
-    state = forecast.state_at(avatar, np.asarray(texels), np.broadcast_to(root, (3, 3)), key)
+    texels = np.broadcast_to(np.asarray(avatar.standing) - root, (3, *avatar.standing.shape))
+    state = forecast.state_at(avatar, texels, np.broadcast_to(root, (3, 3)), key)
     for found, expected in zip(
         jax.tree.leaves((state.context, state.offset)),
         jax.tree.leaves((reset(avatar, key).context, reset(avatar, key).offset)),
@@ -26,7 +27,7 @@ def test_it_is_the_rollout_from_that_state(avatar, tiny_data, key):
     texels, roots = forecast.forecast(avatar, recording, np.array([10]), 3, key)
     assert texels.shape == (1, 3, *recording.texels.shape[1:])
     state = forecast.state_at(avatar, recording.texels[10:13], recording.roots[10:13], jax.random.split(key, 1)[0])
-    frames = rollout(avatar, state, recording.actions[12:15], gaussians=False)[1]
+    frames = rollout(avatar, state, jnp.asarray(recording.actions[12:15]), gaussians=False)[1]
     np.testing.assert_allclose(roots[0], frames.root, atol=1e-4)
     np.testing.assert_allclose(texels[0], forecast.surfaces(avatar.atlas, frames), atol=1e-4)
 
