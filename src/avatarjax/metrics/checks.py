@@ -7,12 +7,12 @@ import typing
 import numpy as np
 
 
-def finite(name: str, values: typing.Any, shape: tuple[int | None, ...]) -> np.ndarray:
-    """`values` as a float64 array of `shape`, where None stands for any length of at least one.
+def finite(name: str, values: typing.Any, shape: tuple[int | None, ...], dtype: typing.Any = np.float64) -> np.ndarray:
+    """`values` as an array of `shape`, where None stands for any length of at least one, and `dtype` (None: its own).
 
     Raises ValueError that says what was given, what was expected and, for numbers that are not finite, where they are.
     """
-    array = np.asarray(values, np.float64)
+    array = np.asarray(values, dtype)
     wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
     fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
     if not fits or array.size == 0:

@@ -79,7 +79,7 @@ def nearest_distance(
     for another number of points.
     """
     checks.finite("training", training[:1], (1, None, 3))
-    checks.finite("frames", frames, (None, training.shape[1], 3))
+    checks.finite("frames", frames, (None, training.shape[1], 3), None)
     known = jnp.asarray(training.reshape(len(training), -1))
     squared = jnp.sum(known**2, axis=1)
     flat = frames.reshape(len(frames), -1)

@@ -56,7 +56,7 @@ class SurfaceFeet(typing.NamedTuple):
         few millimetres when the heel rises or the foot pivots, and the lowest of a few surface points is higher than
         the lowest of a skeleton's sole: compare with slides measured in this way only.
         """
-        toes = checks.finite("points", points, (None, None, 3))[:, self.toes]
+        toes = checks.finite("points", points, (None, None, 3), None)[:, self.toes]
         return foot_slides(toes, toes.mean(axis=2), height=height)
 
 
