@@ -12,19 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from avatarjax import Camera, Gaussians, orbit
+from avatarjax import Camera, Gaussians
+from avatarjax.data.dataset import cardinal_cameras
 from avatarjax.io import atomic
 from avatarjax.splat import SplatConfig, render, required_capacity
 
 VIEW_NAMES = ("front", "left side", "back", "right side")
 CHUNK = 10
 SKY, TILE_LIGHT, TILE_DARK = 0.93, 0.86, 0.80
-
-
-def cardinal_cameras(size: int) -> Camera:
-    """Four cameras about the world's origin that see a standing figure's whole height and a metre around it."""
-    azimuths = np.arange(4) * np.pi / 2
-    return orbit(azimuths, target=(0, 0.85, 0), distance=4.2, heights=0.6, width=size, height=size, fov_y=0.52)
 
 
 def follow(cameras: Camera, position: jax.Array) -> Camera:

@@ -28,6 +28,7 @@ import tyro
 from avatarjax import posmap, unica
 from avatarjax.data import MeshSequence, avatars, building, dataset, load_mesh_sequence
 from avatarjax.io import atomic, exr, ply, video
+from avatarjax.metrics import lpips, pretrained
 from avatarjax.train import read_metrics
 from avatarjax.unica import files, train
 from avatarjax.unica.config import DynamicsName, UnicaConfig
@@ -129,13 +130,14 @@ def run_experiment(args: Args) -> Path:
 
     trained: dict[str, typing.Any] = {}
     upscaler = posmap.build_upscaler(data.atlas, config.upscaled)
+    seen = perceptual_network(config) if config.loss_lpips else None
     steps: dict[str, Callable[[], typing.Any]] = {
         "vae": lambda: train.train_vae(config, data, run, train.new_latent_dynamics(config, data, run)),
         "unet": lambda: train.train_unet(config, data, run, trained["vae"]),
         "coefficients": lambda: train.train_coefficients(config, data, run),
         "pca": lambda: train.fit_alignment(config, data, run),
-        "base": lambda: train.train_base(config, data, run, upscaler),
-        "appearance": lambda: train.train_appearance(config, data, run, upscaler, trained["base"]),
+        "base": lambda: train.train_base(config, data, run, upscaler, seen),
+        "appearance": lambda: train.train_appearance(config, data, run, upscaler, trained["base"], seen),
     }
     for stage in experiment.stages()[1 : last + 1]:
         if stage in steps:
@@ -183,6 +185,17 @@ def prepare(args: Args) -> Experiment:
     (experiment.folder / "checkpoints").mkdir(parents=True, exist_ok=True)
     atomic.write_text(experiment.folder / "config.json", json.dumps(dataclasses.asdict(config), indent=2))
     return experiment
+
+
+def perceptual_network(config: UnicaConfig) -> lpips.Network | None:
+    """The network of the LPIPS loss; None, and a message, where its weights have not been fetched."""
+    if pretrained.available(config.lpips_network):
+        return lpips.load(config.lpips_network)
+    print(
+        f"note: training without the LPIPS term, because the weights of {config.lpips_network} have not been fetched "
+        f"({pretrained.COMMAND})"
+    )
+    return None
 
 
 def forget(experiment: Experiment, stage: str) -> None:

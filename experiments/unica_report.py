@@ -19,8 +19,8 @@ from avatarjax.io import atomic
 from avatarjax.metrics import drift, responsiveness
 from avatarjax.metrics.report import Report
 from avatarjax.metrics.statistics import Estimate, bootstrap, paired_t_test
-from avatarjax.unica import batches, evaluate, forecast
-from experiments import pictures, unica_motion, unica_motion_page
+from avatarjax.unica import batches, evaluate, forecast, image_quality
+from experiments import pictures, unica_images, unica_motion, unica_motion_page
 
 if typing.TYPE_CHECKING:
     from experiments.unica import Experiment
@@ -55,6 +55,7 @@ def write(
         "long_rollout": {"frames": len(rolled.actions), "of": unica_motion.LONG},
         "foot_slide_mm": unica_motion.slides(data, rolled),
         "joints": unica_motion.joint_motion(experiment, data, built, rolled),
+        "images": unica_images.measure(experiment, data, avatar, frames),
         "seconds": experiment.seconds,
     }
     trends = unica_motion.trends(rolled)
@@ -93,10 +94,10 @@ def _stages(experiment: Experiment, data: Dataset, built: dict[str, unica.Avatar
         )
 
     def psnr(one: unica.Avatar, images: typing.Any, refined: bool) -> np.ndarray:
-        return evaluate.image_psnr(one, images, refined=refined)
+        return image_quality.appearance_quality(one, images, refined=refined).psnr
 
     standing, held = data.standing_images, data.held_out_images
-    fresh, base = psnr(evaluate.untrained_base(avatar, data), standing, False), psnr(avatar, standing, False)
+    fresh, base = psnr(image_quality.untrained_base(avatar, standing), standing, False), psnr(avatar, standing, False)
     what = "base attribute map, standing pose, against untrained attributes"
     rows.append(_against(what, base, fresh, np.arange(base.size), "dB", higher=True))
     with_network, without = psnr(avatar, held, True), psnr(avatar, held, False)
@@ -142,6 +143,7 @@ def _page(
     page.media(folder / "video.mp4", "The rollout: every frame is generated from the three before it and the key.")
     page.media(folder / "contact_sheet.png", f"Frames {pictures.key_frames(script)}, four views.")
     unica_motion_page.obedience(page, folder, measured)
+    unica_images.section(page, experiment, measured["images"])
 
     page.heading("Each stage against what costs nothing")
     page.table(

@@ -91,6 +91,27 @@ def test_vertices_lie_where_the_texels_do(tiny_folder, tiny_data):
     np.testing.assert_allclose(texels, arrays["texels"][-1], atol=6e-4)
 
 
+def test_the_truth_is_pictured_from_four_sides_that_follow(tiny_folder, tiny_data):
+    """The root is in the middle of every picture's width, the soles at the height they have in the world."""
+    pictures = dataset.truth_pictures(tiny_folder)
+    assert pictures.shape == (len(tiny_data.truth.actions), 4, 32, 32, 4)
+    cameras = dataset.cardinal_cameras(32)
+    roots = tiny_data.truth.roots * np.array([0, 1, 0], np.float32)
+    upscaler = posmap.build_upscaler(tiny_data.atlas, 64)
+    for frame in (0, 9, len(pictures) - 1):
+        points = np.asarray(posmap.upscale(upscaler, jnp.asarray(tiny_data.truth.texels[frame]))) + roots[frame]
+        for view in range(4):
+            column, row = pixels_of(points, cameras, view)
+            assert near_opaque(pictures[frame, view, ..., 3])[row, column].mean() > 0.98
+
+
+def pixels_of(points, cameras, view):
+    """Columns and rows (n,) in which camera `view` sees points (n, 3)."""
+    world_to_camera, intrinsics = np.asarray(cameras.world_to_camera[view]), np.asarray(cameras.intrinsics[view])
+    seen = (points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]) @ intrinsics.T
+    return np.floor(seen[:, :2] / seen[:, 2:]).astype(int).T
+
+
 def near_opaque(alpha):
     """Pixels that are not transparent, or have such a neighbour."""
     padded = np.pad(alpha > 0, 1)
@@ -108,11 +129,7 @@ def test_pictures_show_the_texels_of_their_pose(tiny_data):
             low, high = points.min(0), points.max(0)
             boxed = (points - (low + high) / 2) / (high - low).max()
             for slot, view in enumerate(images.view[pose]):
-                seen = boxed @ np.asarray(cameras.world_to_camera[view, :3, :3]).T
-                seen = (seen + np.asarray(cameras.world_to_camera[view, :3, 3])) @ np.asarray(
-                    cameras.intrinsics[view]
-                ).T
-                column, row = np.floor(seen[:, :2] / seen[:, 2:]).astype(int).T
+                column, row = pixels_of(boxed, cameras, view)
                 assert near_opaque(images.rgba[pose, slot, ..., 3])[row, column].mean() > 0.98
 
 
@@ -169,14 +186,14 @@ class TestDamage:
             '{"version": 1',
             "[]",
             "3",
-            '{"version": 3, "spec": {}}',
-            '{"version": 3, "spec": {}, "files": []}',
-            '{"version": 3, "spec": {"size": 32}, "files": {}}',
-            '{"version": 3, "spec": [], "files": {"a": 3}}',
+            '{"version": VERSION, "spec": {}}',
+            '{"version": VERSION, "spec": {}, "files": []}',
+            '{"version": VERSION, "spec": {"size": 32}, "files": {}}',
+            '{"version": VERSION, "spec": [], "files": {"a": 3}}',
         ],
     )
     def test_a_damaged_manifest_is_named(self, folder, tiny_spec, text):
-        (folder / "manifest.json").write_text(text)
+        (folder / "manifest.json").write_text(text.replace("VERSION", str(dataset.VERSION)))
         assert not dataset.matches(folder, tiny_spec)
         with pytest.raises(ValueError, match=r"manifest\.json is damaged.*--stage data"):
             dataset.load(folder)

@@ -22,10 +22,11 @@ import numpy as np
 from tqdm import tqdm
 
 from avatarjax import posmap
+from avatarjax.cameras import Camera
 from avatarjax.data import avatars, dataset, dressing, manifest, sequences
 from avatarjax.data.dataset import DatasetSpec
 from avatarjax.data.importers.mesh_sequence import MeshSequence
-from avatarjax.data.mesh_renderer import MeshRenderer
+from avatarjax.data.mesh_renderer import MeshRenderer, PosedMesh
 from avatarjax.data.sequences import Take
 from avatarjax.io import atomic, exr, weights
 from avatarjax.physics.xpbd import XPBDConfig
@@ -242,6 +243,7 @@ class _Maker:
             self.atlas = posmap.build_atlas(source.reference(), source.faces, spec.size)
         self.renderer = MeshRenderer(source.faces, source.uvs, source.texture)
         self.cameras = dataset.cylinder_cameras(spec.image_size)
+        self.cardinal_cameras = dataset.cardinal_cameras(spec.image_size)
         upscaler = posmap.build_upscaler(self.atlas, spec.upscaled)
         self.box = jax.jit(lambda texels: posmap.bounding_box(posmap.upscale(upscaler, texels)))
         if not finished:
@@ -281,6 +283,11 @@ class _Maker:
         for pose, (sequence, frame) in enumerate(plan.poses):
             if sequence == k:
                 self.picture(split, pose, take.texels[frame], vertices[frame], plan.views[pose])
+        if split == "truth":
+            for frame in range(min(dataset.TRUTH_FRAMES, len(vertices))):
+                standing = vertices[frame] + np.array([0, take.roots[frame, 1], 0], np.float32)
+                views = range(dataset.CARDINAL_VIEWS)
+                self.draw(split, frame, self.renderer.pose(standing), self.cardinal_cameras, views)
         arrays = {f.name: getattr(take, f.name) for f in dataclasses.fields(Take)}
         if self.spec.vertices != "none":
             arrays["vertices"] = vertices.astype(self.spec.vertices)
@@ -290,6 +297,10 @@ class _Maker:
         """Write the views of a pose whose `vertices` (v, 3) lie in the frame of its `texels` (t, 3)."""
         box = self.box(jnp.asarray(texels))
         posed = self.renderer.pose((vertices - np.asarray(box.centre)) / np.asarray(box.side))
+        self.draw(name, pose, posed, self.cameras, views)
+
+    def draw(self, name: str, pose: int, posed: PosedMesh, cameras: Camera, views: typing.Any) -> None:
+        """Write what the cameras of these numbers see."""
         for view in views:
-            camera = jax.tree.map(lambda x, v=int(view): x[v], self.cameras)
+            camera = jax.tree.map(lambda x, v=int(view): x[v], cameras)
             exr.write_png(dataset.image_path(self.folder, name, pose, int(view)), posed.render(camera))

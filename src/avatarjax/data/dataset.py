@@ -5,6 +5,7 @@ avatar.safetensors                faces, uvs, rest vertices, skinning weights, a
 texture.png
 clips/train-000.safetensors       texels, roots, actions, joint rotations and, if asked for, all vertices
 images/train/00000_07.png         pose 0 from view 7, straight alpha; images/train.safetensors says which pose
+images/truth/00000_02.png         frame 0 of the report's script from cardinal view 2, the third of four
 """
 
 from __future__ import annotations
@@ -27,8 +28,10 @@ from avatarjax.data import manifest, sequences
 from avatarjax.data.sequences import Recording, Take
 from avatarjax.io import exr, weights
 
-VERSION = 3
+VERSION = 4
 VIEWS = 50  # on the cylinder (UNICA B.1)
+CARDINAL_VIEWS = 4
+TRUTH_FRAMES = 200  # at most so many are pictured (UNICA C.4)
 SPLITS = ("train", "held_out", "truth")
 AGAIN = "build it again with --stage data"
 _GOLDEN = np.pi * (3 - np.sqrt(5))
@@ -107,6 +110,15 @@ def cylinder_cameras(size: int) -> Camera:
     return cameras.orbit(k * _GOLDEN, target=(0, 0, 0), distance=1.75, heights=heights, width=size, height=size)
 
 
+def cardinal_cameras(size: int) -> Camera:
+    """Four cameras (UNICA 4.2) that see a standing figure's whole height and a metre around it, square pictures.
+
+    In metres about the ground under the figure's root: front, left side, back, right side.
+    """
+    azimuths = np.arange(CARDINAL_VIEWS) * np.pi / 2
+    return cameras.orbit(azimuths, target=(0, 0.85, 0), distance=4.2, heights=0.6, width=size, height=size, fov_y=0.52)
+
+
 def matches(folder: Path, spec: DatasetSpec) -> bool:
     """Whether `folder` has a finished dataset of exactly this spec."""
     try:
@@ -143,6 +155,12 @@ def load_take(folder: Path, split: str, k: int) -> Take:
     """One sequence of a split, without its vertices."""
     names = [field.name for field in dataclasses.fields(Take)]
     return Take(**weights.load_arrays(clip_path(folder, split, k), names)[0])
+
+
+def truth_pictures(folder: Path) -> UInt8[np.ndarray, "f v h w 4"]:
+    """The report's script as the meshes do it: its first frames from `cardinal_cameras` that follow the root."""
+    frames = min(TRUTH_FRAMES, read_manifest(Path(folder))["clips"]["truth"][0])
+    return _pictures(Path(folder), "truth", np.tile(np.arange(CARDINAL_VIEWS), (frames, 1)))
 
 
 def fingerprint(folder: Path) -> str:

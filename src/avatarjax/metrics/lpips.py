@@ -19,6 +19,7 @@ from avatarjax.metrics.image import Images, check_images
 
 NAMES = ("alex", "vgg")
 SMALLEST = 32  # pixels, below which the deepest features vanish
+_PAIRS = 4  # compared at a time
 
 # Means and standard deviations of ImageNet's pixels in [0, 1].
 _MEAN = np.array([[[[0.485, 0.456, 0.406]]]], np.float32)
@@ -71,20 +72,21 @@ def distance(network: Network, a: Images, b: Images) -> Float[Array, "..."]:
 
 @jax.jit
 def _distance(network: Network, a: Array, b: Array) -> Array:
-    # One pair after another: features take some hundred times the memory of their picture.
-    flat = (x.reshape(-1, *x.shape[-3:]) for x in (a, b))
-    return jax.lax.map(lambda pair: _pair(network, *pair), tuple(flat)).reshape(a.shape[:-3])
+    # A few pairs at a time: the features take some hundred times the memory of their picture.
+    flat = tuple(x.reshape(-1, *x.shape[-3:]) for x in (a, b))
+    distances = jax.lax.map(lambda pair: _pair(network, jnp.stack(pair)), flat, batch_size=_PAIRS)
+    return distances.reshape(a.shape[:-3])
 
 
-def _pair(network: Network, a: Array, b: Array) -> Array:
-    features = zip(network.heads, _features(network, a[None]), _features(network, b[None]), strict=True)
+def _pair(network: Network, pair: Float[Array, "2 h w 3"]) -> Array:
     # The head weighs channels and does nothing else, so it may come after the mean over places.
-    return sum((jnp.mean((x - y) ** 2, axis=(0, 1, 2)) @ head for head, x, y in features), jnp.zeros(()))
+    features = zip(network.heads, _features(network, pair), strict=True)
+    return sum((jnp.mean((x[0] - x[1]) ** 2, axis=(0, 1)) @ head for head, x in features), jnp.zeros(()))
 
 
-def _features(network: Network, image: Array) -> list[Array]:
+def _features(network: Network, images: Float[Array, "n h w 3"]) -> list[Array]:
     """Features of five layers, each of unit length in every place."""
-    x = (image - _MEAN) / _STD
+    x = (images - _MEAN) / _STD
     taken, layers = [], zip(network.kernels, network.biases, strict=True)
     for layer in _ALEX if network.name == "alex" else _VGG:
         if isinstance(layer, str):

@@ -14,7 +14,7 @@ _KERNEL = np.exp(-0.5 * (_offsets / _SIGMA) ** 2)
 _KERNEL = [float(k) for k in _KERNEL / _KERNEL.sum()]
 
 
-def l1(a: Float[Array, "h w c"], b: Float[Array, "h w c"]) -> Float[Array, ""]:
+def l1(a: Float[Array, "*b h w c"], b: Float[Array, "*b h w c"]) -> Float[Array, ""]:
     """Mean absolute difference."""
     return jnp.mean(jnp.abs(a - b))
 

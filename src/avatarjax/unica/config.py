@@ -65,6 +65,8 @@ class UnicaConfig:
     views_per_step: int = 8
     loss_l1: float = 0.8  # ours; 3DGS' weights, the paper gives none
     loss_ssim: float = 0.2
+    loss_lpips: float = 0.1  # ours; 0 or weights that were not fetched: no such term
+    lpips_network: typing.Literal["alex", "vgg"] = "vgg"  # ours; the paper names none
     vae_stage: StageConfig = StageConfig(300_000, 32, 1.5e-5)
     unet_stage: StageConfig = StageConfig(300_000, 32, 5e-5)
     unet_steady: float = 1 / 3  # of the UNet's steps are its first stage, on steady movement only
@@ -126,6 +128,7 @@ def _small() -> UnicaConfig:
             offset_bound=0.05,
         ),
         views_per_step=4,
+        lpips_network="alex",
         vae_stage=StageConfig(3_000, 16, 3e-3),
         unet_stage=StageConfig(4_500, 8, 3e-4),
         coefficients_stage=StageConfig(6_000, 128, 1e-3, ema=0.998),
@@ -176,6 +179,7 @@ def _ci() -> UnicaConfig:
             offset_bound=0.05,
         ),
         views_per_step=4,
+        lpips_network="alex",
         vae_stage=StageConfig(1_000, 8, 5e-3),
         unet_stage=StageConfig(700, 8, 1e-3),
         coefficients_stage=StageConfig(3_000, 128, 2e-3, ema=0.998),

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from avatarjax.data.dataset import Dataset, Images, cylinder_cameras
+from avatarjax.data.dataset import Dataset
 from avatarjax.posmap import pca as pcs
-from avatarjax.unica import appearance, batches, coefficients, latent
+from avatarjax.unica import batches, coefficients, latent
 from avatarjax.unica import train as training
 from avatarjax.unica.rollout import Avatar
 
@@ -107,32 +107,3 @@ def components(avatar: Avatar, data: Dataset, chosen: Int[np.ndarray, "g"]) -> d
             back = centred @ basis[:count].T @ basis[:count] - centred
             errors[count] = float(millimetres(back.reshape(fourth.shape), np.zeros_like(fourth), scale).mean())
     return errors
-
-
-def untrained_base(avatar: Avatar, data: Dataset) -> Avatar:
-    """The avatar with the base attributes from which its base stage started: what that stage has to beat."""
-    points, side = training.boxed_points(avatar.upscaler, jnp.asarray(data.standing_images.texels[0]))
-    return avatar.replace(base=appearance.initial_base(points, side))
-
-
-def image_psnr(avatar: Avatar, images: Images, *, refined: bool) -> Float[np.ndarray, "p k"]:
-    """PSNR in dB of each picture over black, with the appearance network or with base attributes alone."""
-    cameras = cylinder_cameras(images.rgba.shape[-2])
-    points, side = training.boxed_points(avatar.upscaler, jnp.asarray(images.texels[0]))
-    splat = training.splat_config(appearance.coarse_gaussians(avatar.base, points, side), cameras)
-
-    @jax.jit
-    def of_pose(avatar, texels, views, rgba):
-        points, side = training.boxed_points(avatar.upscaler, texels)
-        cloud = appearance.coarse_gaussians(avatar.base, points, side)
-        if refined:
-            cloud = appearance.refine(avatar.config.appearance, avatar.appearance, cloud)
-
-        def of_view(one):
-            camera, truth = jax.tree.map(lambda x: x[None], one)
-            return training.photometric_loss(avatar.config, cloud, camera, truth, jnp.zeros(()), splat)[1]["psnr"]
-
-        return jax.lax.map(of_view, (views, rgba))
-
-    poses = zip(images.texels, images.view, images.rgba, strict=True)
-    return np.stack([np.asarray(of_pose(avatar, x, training.pick_views(cameras, v), c)) for x, v, c in poses])

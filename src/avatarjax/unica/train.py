@@ -19,17 +19,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from avatarjax import posmap
-from avatarjax.cameras import Camera
 from avatarjax.data import sequences
 from avatarjax.data.dataset import Dataset, cylinder_cameras
+from avatarjax.metrics import lpips
 from avatarjax.nets import functional
 from avatarjax.nets.functional import Params
 from avatarjax.posmap import pca as pcs
-from avatarjax.splat import SplatConfig, render, required_capacity
-from avatarjax.splat.losses import l1, ssim
 from avatarjax.train import TrainState, fit, make_step, new_state, weights
 from avatarjax.train.state import Loss, optimiser
-from avatarjax.unica import appearance, batches, coefficients, latent
+from avatarjax.unica import appearance, batches, coefficients, latent, photometric
 from avatarjax.unica import fit as closed_form
 from avatarjax.unica.coefficients import CoefficientDenoiser, CoefficientDynamics, Context
 from avatarjax.unica.config import StageConfig, UnicaConfig
@@ -266,45 +264,22 @@ def boxed_points(upscaler: posmap.Upscaler, texels: jax.Array) -> tuple[jax.Arra
     return posmap.into_box(box, points), box.side
 
 
-def photometric_loss(
-    config: UnicaConfig, gaussians: typing.Any, views: Camera, rgba: jax.Array, white: jax.Array, splat: SplatConfig
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """L1 and SSIM of renders (k views) against straight-alpha uint8 RGBA over black or white (UNICA B.1, C.2).
+def train_base(
+    config: UnicaConfig,
+    data: Dataset,
+    run: Run,
+    upscaler: posmap.Upscaler,
+    perceptual: lpips.Network | None = None,
+) -> appearance.BaseAttributes:
+    """The base attribute map on the standing pose's 50 views, with frozen means (UNICA B.1).
 
-    `white` () is 0 or 1: alternating backgrounds keep black Gaussians from hiding in front of a black one.
+    Without a `perceptual` network the loss has no LPIPS term.
     """
-    target = rgba.astype(jnp.float32) / 255
-    target = target[..., :3] * target[..., 3:] + white * (1 - target[..., 3:])
-
-    def one(inputs):
-        camera, truth = inputs
-        out = render(gaussians, camera, background=white, config=splat)
-        squared = jnp.mean((jnp.clip(out.image, 0, 1) - truth) ** 2)
-        return l1(out.image, truth), ssim(out.image, truth), squared, out.info.dropped
-
-    absolute, similarity, squared, dropped = jax.lax.map(one, (views, target))
-    loss = config.loss_l1 * jnp.mean(absolute) + config.loss_ssim * (1 - jnp.mean(similarity))
-    psnr = -10 * jnp.mean(jnp.log10(jnp.maximum(squared, 1e-10)))
-    return loss, {"psnr": psnr, "dropped": jnp.sum(dropped).astype(jnp.float32)}
-
-
-def pick_views(cameras: Camera, views: np.ndarray) -> Camera:
-    """The cameras of these ids from a batch of cameras."""
-    return jax.tree.map(lambda x: x[views], cameras)
-
-
-def splat_config(gaussians: typing.Any, cameras: Camera) -> SplatConfig:
-    """Room for three times what the cloud needs before training: its Gaussians will grow."""
-    return SplatConfig(capacity=min(2**24, 3 * required_capacity(gaussians, cameras)), depth=False)
-
-
-def train_base(config: UnicaConfig, data: Dataset, run: Run, upscaler: posmap.Upscaler) -> appearance.BaseAttributes:
-    """The base attribute map on the standing pose's 50 views, with frozen means (UNICA B.1)."""
     stage, images = config.base_stage, data.standing_images
     cameras = cylinder_cameras(images.rgba.shape[-2])
     points, side = boxed_points(upscaler, jnp.asarray(images.texels[0]))
     start = appearance.initial_base(points, side)
-    splat = splat_config(appearance.coarse_gaussians(start, points, side), cameras)
+    splat = photometric.splat_config(appearance.coarse_gaussians(start, points, side), cameras)
 
     def batch_at(step):
         rng = batches.generator(run.seed, step)
@@ -312,7 +287,8 @@ def train_base(config: UnicaConfig, data: Dataset, run: Run, upscaler: posmap.Up
         return {
             "points": points,
             "height": side,
-            "views": pick_views(cameras, images.view[0, slots]),
+            "perceptual": perceptual,
+            "views": photometric.pick_views(cameras, images.view[0, slots]),
             "rgba": images.rgba[0, slots],
             "white": np.float32(rng.integers(2)),
         }
@@ -320,21 +296,32 @@ def train_base(config: UnicaConfig, data: Dataset, run: Run, upscaler: posmap.Up
     def loss(params, key, batch):
         base = appearance.BaseAttributes(**params, height=batch["height"])
         cloud = appearance.coarse_gaussians(base, batch["points"], batch["height"])
-        return photometric_loss(config, cloud, batch["views"], batch["rgba"], batch["white"], splat)
+        return photometric.loss(
+            config, cloud, batch["views"], batch["rgba"], batch["white"], splat, batch["perceptual"]
+        )
 
     initial = {name: getattr(start, name) for name in ("log_scales", "quats", "logit_opacities", "colors")}
-    trained = _train(run, "base", stage, (config.loss_l1, config.loss_ssim), loss, initial, batch_at)
+    settings = photometric.settings(config, perceptual)
+    trained = _train(run, "base", stage, settings, loss, initial, batch_at)
     return start.replace(**trained)
 
 
 def train_appearance(
-    config: UnicaConfig, data: Dataset, run: Run, upscaler: posmap.Upscaler, base: appearance.BaseAttributes
+    config: UnicaConfig,
+    data: Dataset,
+    run: Run,
+    upscaler: posmap.Upscaler,
+    base: appearance.BaseAttributes,
+    perceptual: lpips.Network | None = None,
 ) -> Params:
-    """The point transformer on training poses and random views of each (UNICA B.1, C.2)."""
+    """The point transformer on training poses and random views of each (UNICA B.1, C.2).
+
+    Without a `perceptual` network the loss has no LPIPS term.
+    """
     stage, images = config.appearance_stage, data.train_images
     cameras = cylinder_cameras(images.rgba.shape[-2])
     points, side = boxed_points(upscaler, jnp.asarray(images.texels[0]))
-    splat = splat_config(appearance.coarse_gaussians(base, points, side), cameras)
+    splat = photometric.splat_config(appearance.coarse_gaussians(base, points, side), cameras)
     k = min(config.views_per_step, images.view.shape[1])
 
     def batch_at(step):
@@ -344,8 +331,9 @@ def train_appearance(
         return {
             "upscaler": upscaler,
             "base": base,
+            "perceptual": perceptual,
             "texels": images.texels[poses],
-            "views": pick_views(cameras, images.view[poses[:, None], slots]),
+            "views": photometric.pick_views(cameras, images.view[poses[:, None], slots]),
             "rgba": images.rgba[poses[:, None], slots],
             "white": rng.integers(0, 2, stage.batch).astype(np.float32),
         }
@@ -359,10 +347,11 @@ def train_appearance(
         # The network runs outside the loop over poses: inside one, XLA's CPU backend uses a single core.
         clouds = jax.vmap(dressed)(batch["texels"])
         value, metrics = jax.lax.map(
-            lambda pose: photometric_loss(config, *pose, splat), (clouds, batch["views"], batch["rgba"], batch["white"])
+            lambda pose: photometric.loss(config, *pose, splat, batch["perceptual"]),
+            (clouds, batch["views"], batch["rgba"], batch["white"]),
         )
         return jnp.mean(value), jax.tree.map(jnp.mean, metrics)
 
     initial = functional.init(appearance.AppearanceNetwork, config.appearance, run.key("appearance"))
-    settings = (config.appearance, config.base_stage, config.views_per_step, config.loss_l1, config.loss_ssim)
+    settings = (config.appearance, config.base_stage, config.views_per_step, *photometric.settings(config, perceptual))
     return _train(run, "appearance", stage, settings, loss, initial, batch_at)
