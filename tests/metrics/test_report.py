@@ -190,8 +190,8 @@ def test_a_comparison_says_where_the_papers_number_is_from(tmp_path):
 
 def test_plots_keep_their_text_and_follow_the_pages_colour(tmp_path, caplog):
     def draw(axes):
-        x = np.arange(4.0)
-        draw_band(axes, x, x, x - 1, x + 1, "trend")
+        line = np.arange(4.0)
+        draw_band(axes, np.arange(4), line, line - 1, line + 1, "trend")
         axes.set_xlabel("frame < 4")
         axes.legend()
 

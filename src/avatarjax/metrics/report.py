@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 
 from avatarjax.io import atomic
 from avatarjax.metrics import environment
@@ -175,7 +175,7 @@ class Report:
 
 def draw_band(
     axes: typing.Any,
-    x: Float[np.ndarray, " n"],
+    x: Real[np.ndarray, " n"],
     line: Float[np.ndarray, " n"],
     lower: Float[np.ndarray, " n"],
     upper: Float[np.ndarray, " n"],
