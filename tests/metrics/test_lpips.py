@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 
 from avatarjax.metrics import lpips
-from tests.metrics.pictures import pairs
+from tests.metrics.pictures import LPIPS, pairs
 
-# By the package lpips 0.1.4 in float64 (its own heads, version 0.1) with these backbones' weights.
-KNOWN = {
-    "alex": [0.06822913, 0.26595989, 0.40494395],
-    "vgg": [0.1592388, 0.30377103, 0.45121724],
-}
 # SHA-256 of the float32 bytes of the five heads in that package, one after another.
 HEADS = {
     "alex": "718a8b40b0d22f96192d34ab93c0db5c7943558ff6c2407f44812dce2f29b5f4",
@@ -38,7 +33,7 @@ def pictures():
 
 
 def test_known_answers_on_three_pictures(network, pictures):
-    np.testing.assert_allclose(lpips.distance(network, *pictures), KNOWN[network.name], atol=1e-5)
+    np.testing.assert_allclose(lpips.distance(network, *pictures), LPIPS[network.name], atol=1e-5)
 
 
 def test_the_heads_are_those_of_the_authors(network):
