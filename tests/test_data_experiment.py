@@ -5,6 +5,7 @@ import shutil
 
 import jax
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from avatarjax.data import dataset
 from avatarjax.io import exr
@@ -22,6 +23,8 @@ def run(tiny_folder, tiny_spec, tmp_path_factory):
         patch.setattr(data, "spec", lambda *_: tiny_spec)
         assert data.main(["--avatar", "cowgirl", "--preset", "ci", "--out", str(out)]) == 0
     jax.config.update("jax_compilation_cache_dir", cached)
+    # Once opened the cache stays in use for all that follows, whatever the configuration says.
+    compilation_cache.reset_cache()
     return folder
 
 
