@@ -2,10 +2,10 @@
 
     python -m experiments.unica --avatar cowgirl               # preset small, the default on a CPU
     python -m experiments.unica --avatar cowgirl --preset ci   # everything, both dynamics models, in minutes
-    python -m experiments.unica --avatar cowgirl --dynamics unet
+    python -m experiments.unica --avatar cowgirl --dynamics unet --appearance point_transformer   # the paper's parts
     python -m experiments.unica --avatar cowgirl --stage report
 
-Stages in order: data, vae, unet, coefficients, pca, base, appearance, rollout, report. Results lie in
+Stages in order: data, vae, unet, coefficients, pca, base, appearance, texels, rollout, report. Results lie in
 OUT/unica/AVATAR/PRESET/; open report.html there. A second run reuses what is finished, an interrupted one goes on.
 """
 
@@ -30,11 +30,11 @@ from avatarjax.data import MeshSequence, avatars, building, dataset, load_mesh_s
 from avatarjax.io import atomic, exr, ply, video
 from avatarjax.metrics import lpips, pretrained
 from avatarjax.train import read_metrics
-from avatarjax.unica import files, train
-from avatarjax.unica.config import DynamicsName, UnicaConfig
+from avatarjax.unica import files, train, train_appearance
+from avatarjax.unica.config import AppearanceName, DynamicsName, UnicaConfig
 from experiments import pictures, unica_report
 
-STAGES = ("data", "vae", "unet", "coefficients", "pca", "base", "appearance", "rollout", "report")
+STAGES = ("data", "vae", "unet", "coefficients", "pca", "base", "appearance", "texels", "rollout", "report")
 SCRIPT = (1,) * 60 + (2,) * 60 + (3,) * 60 + (0,) * 20  # UNICA C.4: 60 W, 60 S, 60 A, 20 idle
 ROLLOUT_CHUNK = 20
 
@@ -53,6 +53,8 @@ class Args:
     """Sizes: ci, small, base or paper. Without it, small on a CPU and base on an accelerator."""
     dynamics: DynamicsName | None = None
     """The model that drives the rollout: coefficients (fast) or unet (the paper's). Default: the preset's."""
+    appearance: AppearanceName | None = None
+    """What dresses it: texels (fast) or point_transformer (the paper's). Default: the preset's."""
     stage: str = "all"
     """Run only this stage, anew; stages before it are reused, or run where they are missing."""
     resume: bool = True
@@ -80,13 +82,25 @@ class Experiment:
         others = tuple(n for n in names if n != self.config.dynamics)
         return (self.config.dynamics, *(others if self.config.train_both else ()))
 
+    @property
+    def appearances(self) -> tuple[AppearanceName, ...]:
+        """The appearance models that this run trains, the one that dresses its rollout first."""
+        names = typing.get_args(AppearanceName)
+        others = tuple(n for n in names if n != self.config.appearance_model)
+        return (self.config.appearance_model, *(others if self.config.train_both else ()))
+
     def stages(self) -> list[str]:
         """The stages of this run in order."""
         skipped = set()
         if "unet" not in self.models:
-            skipped |= {"vae", "unet"}
+            # The coefficient model's maps need no alignment.
+            skipped |= {"vae", "unet", "pca"}
         if "coefficients" not in self.models:
             skipped.add("coefficients")
+        if "point_transformer" not in self.appearances:
+            skipped.add("appearance")
+        if "texels" not in self.appearances:
+            skipped.add("texels")
         return [s for s in STAGES if s not in skipped]
 
     def spec(self) -> dataset.DatasetSpec:
@@ -136,8 +150,9 @@ def run_experiment(args: Args) -> Path:
         "unet": lambda: train.train_unet(config, data, run, trained["vae"]),
         "coefficients": lambda: train.train_coefficients(config, data, run),
         "pca": lambda: train.fit_alignment(config, data, run),
-        "base": lambda: train.train_base(config, data, run, upscaler, seen),
-        "appearance": lambda: train.train_appearance(config, data, run, upscaler, trained["base"], seen),
+        "base": lambda: train_appearance.train_base(config, data, run, upscaler, seen),
+        "appearance": lambda: train_appearance.train_appearance(config, data, run, upscaler, trained["base"], seen),
+        "texels": lambda: train_appearance.train_texels(config, data, run, upscaler, trained["base"], seen),
     }
     for stage in experiment.stages()[1 : last + 1]:
         if stage in steps:
@@ -147,15 +162,24 @@ def run_experiment(args: Args) -> Path:
     if last < experiment.stages().index("rollout"):
         return folder
 
-    built = {name: assemble(config, data, upscaler, trained, name) for name in experiment.models}
+    built = {
+        name: assemble(config, data, upscaler, trained, name, config.appearance_model) for name in experiment.models
+    }
     for name, avatar in built.items():
         files.save(folder / files.file_name(name), avatar)
     avatar = built[config.dynamics]
+    dressed = {
+        name: assemble(config, data, upscaler, trained, config.dynamics, name) for name in experiment.appearances
+    }
     announce("rollout", f"{len(SCRIPT)} frames, four views each")
     frames = timed(experiment, "rollout", lambda: roll_and_draw(experiment, avatar))
     if last == experiment.stages().index("report"):
         announce("report", "measuring against held-out data")
-        timed(experiment, "report", lambda: unica_report.write(experiment, data, built, frames, SCRIPT))
+        timed(
+            experiment,
+            "report",
+            lambda: unica_report.write(experiment, data, built, dressed, trained["base"], frames, SCRIPT),
+        )
         announce("report", f"open {folder / 'report.html'}")
     return folder
 
@@ -172,6 +196,8 @@ def prepare(args: Args) -> Experiment:
     config = unica.preset(args.preset)
     if args.dynamics:
         config = dataclasses.replace(config, dynamics=args.dynamics)
+    if args.appearance:
+        config = dataclasses.replace(config, appearance_model=args.appearance)
     if meshes is not None:
         config = dataclasses.replace(config, actions=len(meshes.action_names))
     # Another seed is another run: it must not replace the results of the first.
@@ -232,17 +258,21 @@ def assemble(
     upscaler: posmap.Upscaler,
     trained: dict[str, typing.Any],
     dynamics: DynamicsName,
+    appearance: AppearanceName,
 ) -> unica.Avatar:
     """A finished avatar from the results of the stages."""
+    # The texel head has base attributes of its own.
+    params, base = trained["texels"] if appearance == "texels" else (trained["appearance"], trained["base"])
     return unica.Avatar(
         atlas=data.atlas,
         upscaler=upscaler,
-        pca=trained["pca"],
-        base=trained["base"],
-        appearance=trained["appearance"],
+        tangents=posmap.tangents(data.atlas),
+        pca=trained["pca"] if dynamics == "unet" else None,
+        base=base,
+        appearance=params,
         dynamics=trained[dynamics],
         standing=data.standing,
-        config=dataclasses.replace(config, dynamics=dynamics),
+        config=dataclasses.replace(config, dynamics=dynamics, appearance_model=appearance),
     )
 
 

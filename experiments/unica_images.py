@@ -14,6 +14,7 @@ from avatarjax.metrics import fvd, i3d, lpips, pretrained, published
 from avatarjax.metrics.report import Report
 from avatarjax.metrics.statistics import Estimate, bootstrap
 from avatarjax.unica import image_quality
+from avatarjax.unica.config import AppearanceName
 
 if typing.TYPE_CHECKING:
     from experiments.unica import Experiment
@@ -21,11 +22,19 @@ if typing.TYPE_CHECKING:
 NEXT_FRAMES = 50  # of the script, in four views
 
 
-def measure(experiment: Experiment, data: Dataset, avatar: unica.Avatar, frames: unica.Frame) -> dict[str, typing.Any]:
+def measure(
+    experiment: Experiment,
+    data: Dataset,
+    dressed: dict[AppearanceName, unica.Avatar],
+    plain: unica.Avatar,
+    frames: unica.Frame,
+) -> dict[str, typing.Any]:
     """PSNR, SSIM and LPIPS of pictured held-out poses and of next frames, and FVD of the rollout of the script.
 
-    What needs weights that were not fetched is None.
+    `dressed` are the avatars of the run by their appearance model, the one whose rollout this is first, and
+    `plain` has the attributes of the base stage. What needs weights that were not fetched is None.
     """
+    avatar = next(iter(dressed.values()))
     perceptual = lpips.load("alex") if pretrained.available("alex") else None
     pictures = dataset.truth_pictures(experiment.folder / "data")
     chosen = np.unique(np.linspace(image_quality.CONTEXT, len(pictures) - 1, NEXT_FRAMES).astype(int))
@@ -33,8 +42,8 @@ def measure(experiment: Experiment, data: Dataset, avatar: unica.Avatar, frames:
     held = data.held_out_images
     return {
         "poses": {
-            "base attributes": _summary(image_quality.appearance_quality(avatar, held, perceptual, refined=False)),
-            "appearance network": _summary(image_quality.appearance_quality(avatar, held, perceptual)),
+            "base attributes": _summary(image_quality.appearance_quality(plain, held, perceptual, refined=False)),
+            **{n: _summary(image_quality.appearance_quality(a, held, perceptual)) for n, a in dressed.items()},
         },
         "next frame": _summary(image_quality.next_frame_quality(avatar, data.truth, pictures, chosen, key, perceptual)),
         "fvd": _fvd(image_quality.video(avatar, frames, pictures.shape[2]), image_quality.truth_video(pictures)),
@@ -64,7 +73,7 @@ def _fvd(generated: np.ndarray, truth: np.ndarray) -> dict[str, typing.Any] | No
 def section(page: Report, experiment: Experiment, found: dict[str, typing.Any]) -> None:
     """What was measured, beside the paper's numbers for this avatar where it has them."""
     page.heading("How does it look?")
-    rows = [(name, *values.values()) for name, values in found["poses"].items()]
+    rows = [(name.replace("_", " "), *values.values()) for name, values in found["poses"].items()]
     page.table(
         f"Held-out poses in random views against pictures of the mesh, {found['pixels']} pixels, over black: means "
         "with 95 % intervals from a bootstrap over poses. LPIPS is that of AlexNet, smaller is better.",

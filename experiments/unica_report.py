@@ -20,6 +20,8 @@ from avatarjax.metrics import drift, responsiveness
 from avatarjax.metrics.report import Report
 from avatarjax.metrics.statistics import Estimate, bootstrap, paired_t_test
 from avatarjax.unica import batches, evaluate, forecast, image_quality
+from avatarjax.unica.appearance import BaseAttributes
+from avatarjax.unica.config import AppearanceName
 from experiments import pictures, unica_images, unica_motion, unica_motion_page
 
 if typing.TYPE_CHECKING:
@@ -32,12 +34,18 @@ def write(
     experiment: Experiment,
     data: Dataset,
     built: dict[str, unica.Avatar],
+    dressed: dict[AppearanceName, unica.Avatar],
+    base: BaseAttributes,
     frames: unica.Frame,
     script: tuple[int, ...],
 ) -> None:
-    """Measure, plot and write metrics.json and report.html into the run's folder."""
+    """Measure, plot and write metrics.json and report.html into the run's folder.
+
+    `built` are the avatars by their dynamics, `dressed` by what dresses them, `base` the attributes of the base stage.
+    """
     folder, driver, seed = experiment.folder, experiment.config.dynamics, experiment.args.seed
     avatar = built[driver]
+    plain = avatar.replace(base=base)
     yaw, moves = unica_motion.asked(data, experiment.config.actions)
     paths = {driver: _before_each_action(avatar, np.asarray(frames.root))}
     paths |= {name: _path(one, script, seed) for name, one in built.items() if name != driver}
@@ -49,13 +57,13 @@ def write(
     nearest = _nearest(avatar, data, frames)
     measured: dict[str, typing.Any] = {
         "responses": answers,
-        "stages": _stages(experiment, data, built),
+        "stages": _stages(experiment, data, built, dressed, plain),
         "turning": unica_motion.answers(data, avatar, rolled),
         "drift_mm": {n: bootstrap(x) for n, x in nearest.items()},
         "long_rollout": {"frames": len(rolled.actions), "of": unica_motion.LONG},
         "foot_slide_mm": unica_motion.slides(data, rolled),
         "joints": unica_motion.joint_motion(experiment, data, built, rolled),
-        "images": unica_images.measure(experiment, data, avatar, frames),
+        "images": unica_images.measure(experiment, data, dressed, plain, frames),
         "seconds": experiment.seconds,
     }
     trends = unica_motion.trends(rolled)
@@ -75,10 +83,15 @@ def _held_out(experiment: Experiment, data: Dataset) -> tuple[batches.Windows, n
     return windows, np.unique(np.linspace(0, len(windows.first) - 1, GROUPS).astype(int))
 
 
-def _stages(experiment: Experiment, data: Dataset, built: dict[str, unica.Avatar]) -> list[dict[str, typing.Any]]:
+def _stages(
+    experiment: Experiment,
+    data: Dataset,
+    built: dict[str, unica.Avatar],
+    dressed: dict[AppearanceName, unica.Avatar],
+    plain: unica.Avatar,
+) -> list[dict[str, typing.Any]]:
     """Each stage beside what costs nothing, on the same held-out items: see `_against`."""
     windows, chosen = _held_out(experiment, data)
-    avatar = built[experiment.config.dynamics]
     sequence = np.asarray(data.held_out.sequence)[windows.first[chosen]]
     rows = []
     for name, one in built.items():
@@ -97,13 +110,14 @@ def _stages(experiment: Experiment, data: Dataset, built: dict[str, unica.Avatar
         return image_quality.appearance_quality(one, images, refined=refined).psnr
 
     standing, held = data.standing_images, data.held_out_images
-    fresh, base = psnr(image_quality.untrained_base(avatar, standing), standing, False), psnr(avatar, standing, False)
+    fresh, base = psnr(image_quality.untrained_base(plain, standing), standing, False), psnr(plain, standing, False)
     what = "base attribute map, standing pose, against untrained attributes"
     rows.append(_against(what, base, fresh, np.arange(base.size), "dB", higher=True))
-    with_network, without = psnr(avatar, held, True), psnr(avatar, held, False)
+    without = psnr(plain, held, False)
     pose = np.repeat(np.arange(len(without)), without.shape[1])
-    what = "appearance network, against the base attribute map"
-    rows.append(_against(what, with_network, without, pose, "dB", higher=True))
+    for name, one in dressed.items():
+        what = f"{name.replace('_', ' ')}, against the base attribute map"
+        rows.append(_against(what, psnr(one, held, True), without, pose, "dB", higher=True))
     return rows
 
 

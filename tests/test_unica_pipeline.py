@@ -27,6 +27,7 @@ def tiny():
             image_views=2,
             standing_views=4,
             image_size=32,
+            cloth_steps=6,
         ),
         views_per_step=2,
         vae_stage=few,
@@ -34,6 +35,7 @@ def tiny():
         coefficients_stage=dataclasses.replace(few, ema=0.9, batch=8),
         base_stage=few,
         appearance_stage=few,
+        texels_stage=few,
     )
 
 
@@ -50,7 +52,7 @@ def test_everything_that_is_promised_is_written(finished):
     expected = ["config.json", "metrics.json", "report.html", "video.mp4", "contact_sheet.png", "path.png", "frame.ply"]
     for name in [*expected, "avatar-coefficients.safetensors", "avatar-unet.safetensors"]:
         assert (finished / name).stat().st_size > 100, name
-    for stage in ("vae", "unet", "coefficients", "base", "appearance"):
+    for stage in ("vae", "unet", "coefficients", "base", "appearance", "texels"):
         assert (finished / "checkpoints" / f"{stage}.safetensors").is_file()
         assert (finished / "checkpoints" / f"{stage}.jsonl").read_text().count("\n") == 3
 
@@ -76,7 +78,8 @@ def test_the_report_names_every_stage_and_embeds_its_pictures(finished):
         "Motion error",
         "Foot slide",
         "jaxlib",
-        "appearance network",
+        "point transformer, against",
+        "texels, against",
         "What is poor",
     ):
         assert text in page
@@ -86,14 +89,14 @@ def test_the_report_names_every_stage_and_embeds_its_pictures(finished):
 
 def test_a_second_run_reuses_what_is_finished(finished, capsys):
     before = {p: p.stat().st_mtime_ns for p in (finished / "checkpoints").glob("*.safetensors")}
-    args = experiment.Args(preset="ci", out=finished.parents[2], stage="appearance")
-    (finished / "checkpoints" / "appearance.jsonl").unlink()
+    args = experiment.Args(preset="ci", out=finished.parents[2], stage="texels")
+    (finished / "checkpoints" / "texels.jsonl").unlink()
     experiment.run_experiment(args)
     printed = capsys.readouterr()
     assert "data: finished before, reused" in printed.out
     after = {p: p.stat().st_mtime_ns for p in (finished / "checkpoints").glob("*.safetensors")}
     changed = {p.stem for p in after if after[p] != before[p]}
-    assert changed == {"appearance"}
+    assert changed == {"texels"}
 
 
 def test_a_damaged_dataset_is_named_with_the_way_out(finished):

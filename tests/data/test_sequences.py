@@ -56,6 +56,33 @@ def test_too_short_sequences_are_refused():
         sequences.transition_scripts(59, 0)
 
 
+class TestChains:
+    @pytest.fixture
+    def chains(self):
+        return sequences.chain_scripts(300, 3)
+
+    def test_they_are_as_long_as_the_transitions(self, chains):
+        assert [len(c) for c in chains] == [300] * 20
+        assert sum(len(c) for c in sequences.chain_scripts(None, 0)) == 6253
+
+    def test_keys_are_held_as_long_as_they_say(self, chains):
+        for chain in chains:
+            lengths = np.diff(np.flatnonzero(np.append(True, np.diff(chain) != 0)))
+            assert len(lengths) >= 3 and lengths.min() >= 35 and lengths.max() <= 80
+
+    def test_every_ordered_pair_comes_about_equally_often(self, chains):
+        pairs = np.zeros((5, 5), int)
+        for chain in chains:
+            changed = np.flatnonzero(np.diff(chain))
+            np.add.at(pairs, (chain[changed], chain[changed + 1]), 1)
+        others = pairs[~np.eye(5, dtype=bool)]
+        assert others.min() >= 2 and others.max() - others.min() <= 3
+
+    def test_they_depend_on_the_seed_alone(self, chains):
+        np.testing.assert_array_equal(chains, sequences.chain_scripts(300, 3))
+        assert np.any(np.not_equal(chains, sequences.chain_scripts(300, 4)))
+
+
 @pytest.mark.parametrize("length", [1, 2, 4, 9])
 def test_windows_are_all_those_inside_one_sequence(length):
     sequence = np.repeat([0, 1, 2, 3], [5, 3, 4, 12]).astype(np.int32)

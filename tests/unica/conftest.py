@@ -10,12 +10,13 @@ import pytest
 from avatarjax import posmap
 from avatarjax.nets.point_transformer import PointTransformerConfig
 from avatarjax.posmap import pca as pcs
-from avatarjax.unica import Avatar, appearance, batches, fit, train
+from avatarjax.unica import Avatar, appearance, batches, fit, texel_head, train, train_appearance
 from avatarjax.unica.appearance import AppearanceConfig, AppearanceNetwork
 from avatarjax.unica.coefficients import CoefficientConfig, CoefficientDenoiser, CoefficientDynamics
 from avatarjax.unica.config import DataConfig, UnicaConfig
 from avatarjax.unica.denoiser import Denoiser, DenoiserConfig
 from avatarjax.unica.latent import LatentConfig, LatentDynamics
+from avatarjax.unica.texel_head import TexelHead, TexelHeadConfig
 from avatarjax.unica.vae import VAE, VAEConfig
 from tests.parameters import random_params
 
@@ -24,6 +25,8 @@ TINY = UnicaConfig(
     upscaled=64,
     pca_components=16,
     dynamics="coefficients",
+    appearance_model="texels",
+    texel_head=TexelHeadConfig(code=4, width=8),
     data=DataConfig(60, 60, 2, 2, 2, 32),
     latent=LatentConfig(
         vae=VAEConfig(channels=(8, 16), residual_blocks=1),
@@ -68,7 +71,7 @@ def upscaler(tiny_data):
 @pytest.fixture(scope="session")
 def base(tiny_data, upscaler):
     """Base attributes of many colours and turns, as if trained."""
-    points, side = jax.jit(train.boxed_points)(upscaler, jnp.asarray(tiny_data.standing_images.texels[0]))
+    points, side = jax.jit(train_appearance.boxed_points)(upscaler, jnp.asarray(tiny_data.standing_images.texels[0]))
     rng = np.random.default_rng(0)
     n = len(points)
     return appearance.initial_base(points, side).replace(
@@ -112,22 +115,36 @@ def latent_dynamics(tiny_data):
 
 
 @pytest.fixture(scope="session")
-def avatars(tiny_data, upscaler, base, coefficient_dynamics, latent_dynamics):
-    """An avatar of each model by the model's name; untrained, so what they do is wild but well defined."""
+def head(tiny_data):
+    """Parameters of the texel head at random."""
+    params = texel_head.init(TINY.texel_head, len(tiny_data.atlas.rows), jax.random.key(5))
+    return params | {"network": random_params(TexelHead, TINY.texel_head, scale=0.3)}
+
+
+@pytest.fixture(scope="session")
+def avatars(tiny_data, upscaler, base, head, coefficient_dynamics, latent_dynamics):
+    """An avatar of each model by the model's name; untrained, so what they do is wild but well defined.
+
+    The coefficient model goes with the texel head, the UNet with alignment and point transformer.
+    """
     windows = batches.windows(tiny_data.train, 4, TINY.turn_window)
     groups, _ = windows.groups(np.arange(0, len(windows.first), 4), float(tiny_data.atlas.scale))
     fourth = jnp.asarray(groups[:, 3])
     parts = {
         "atlas": tiny_data.atlas,
         "upscaler": upscaler,
-        "pca": fit_basis(fourth.reshape(len(fourth), -1), TINY.pca_components, jax.random.key(2)),
+        "tangents": posmap.tangents(tiny_data.atlas),
         "base": base,
-        "appearance": random_params(AppearanceNetwork, TINY.appearance, scale=0.1),
         "standing": tiny_data.standing,
     }
+    paper = {
+        "pca": fit_basis(fourth.reshape(len(fourth), -1), TINY.pca_components, jax.random.key(2)),
+        "appearance": random_params(AppearanceNetwork, TINY.appearance, scale=0.1),
+        "config": dataclasses.replace(TINY, dynamics="unet", appearance_model="point_transformer"),
+    }
     return {
-        "coefficients": Avatar(dynamics=coefficient_dynamics, config=TINY, **parts),
-        "unet": Avatar(dynamics=latent_dynamics, config=dataclasses.replace(TINY, dynamics="unet"), **parts),
+        "coefficients": Avatar(dynamics=coefficient_dynamics, appearance=head, pca=None, config=TINY, **parts),
+        "unet": Avatar(dynamics=latent_dynamics, **parts, **paper),
     }
 
 

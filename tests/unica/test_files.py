@@ -29,6 +29,19 @@ def test_a_loaded_avatar_is_the_saved_one(avatar, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
+def test_half_precision_halves_the_file_and_changes_little(avatar, tmp_path):
+    unica.save(tmp_path / "full.safetensors", avatar)
+    unica.save(tmp_path / "half.safetensors", avatar, half=True, seed=3)
+    full, half = (tmp_path / f"{name}.safetensors" for name in ("full", "half"))
+    assert half.stat().st_size < 0.7 * full.stat().st_size
+    assert weights.load_arrays(half)[1]["seed"] == 3
+    loaded = unica.load(half)
+    np.testing.assert_array_equal(loaded.atlas.reference, avatar.atlas.reference)
+    for a, b in zip(jax.tree.leaves(loaded), jax.tree.leaves(avatar), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+
+
 def test_a_run_folder_and_a_name_are_found(run_folder, monkeypatch):
     runs = run_folder.parents[2]
     for found in (unica.load(run_folder), unica.load("cowgirl", runs=runs)):
@@ -73,7 +86,7 @@ def test_another_kind_of_file_is_named(tmp_path):
 
 @pytest.mark.parametrize("missing", ["dynamics/", "standing", "pca/mean", "atlas/rows"])
 def test_a_file_that_lacks_a_part_is_named(run_folder, missing):
-    path = run_folder / files.file_name("coefficients")
+    path = run_folder / files.file_name("unet")
     arrays, metadata = weights.load_arrays(path)
     rest = {name: value for name, value in arrays.items() if not name.startswith(missing)}
     weights.save_tree(path, weights.nest(rest), **metadata)

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from avatarjax import unica
+from avatarjax import posmap, unica
 from avatarjax.data.dataset import Images, cardinal_cameras, cylinder_cameras
 from avatarjax.unica import image_quality
+from avatarjax.unica.avatar import in_box, wear_base
 from avatarjax.unica.forecast import state_at
 from tests.unica.test_photometric import untrained_network
 
@@ -62,8 +63,9 @@ def test_its_own_pictures_are_the_best_there_are(one, tiny_data):
     splat = image_quality._splat_config(one, images.texels[0], cameras)
 
     def own(texels, views):
-        points, side = image_quality.boxed_points(one.upscaler, jnp.asarray(texels))
-        cloud = image_quality.appearance.coarse_gaussians(one.base, points, side)
+        texels = jnp.asarray(texels)
+        box = posmap.bounding_box(posmap.upscale(one.upscaler, texels))
+        cloud = in_box(wear_base(one, texels), box)
         return image_quality._draw(cloud, jax.tree.map(lambda x: x[views], cameras), splat)
 
     drawn = opaque([own(t, v) for t, v in zip(images.texels, images.view, strict=True)])

@@ -129,21 +129,28 @@ def test_dressing_a_frame_gives_its_gaussians(avatar, rolled):
     assert_same(jax.jit(unica.dress)(avatar, frame.replace(gaussians=None)), frame.gaussians, 2e-4)
 
 
+def aligned(avatar, texels):
+    return texels if avatar.pca is None else pca.align(avatar.pca, texels)
+
+
 def test_gaussians_are_where_the_aligned_texels_are_in_the_world(avatar, rolled):
-    """Their centroid is exactly that of the upscaled points: a least-squares similarity keeps centroids."""
-    texels = texels_of(avatar, rolled[1])[3]
-    points = posmap.upscale(avatar.upscaler, pca.align(avatar.pca, texels))
+    """A least-squares similarity keeps the centroid of the upscaled points; the texel head may move each a little."""
+    points = posmap.upscale(avatar.upscaler, aligned(avatar, texels_of(avatar, rolled[1])[3]))
     origin = rolled[1].root[2]  # the root of the frame before
-    world = posmap.denormalize(avatar.atlas, points, origin)
-    np.testing.assert_allclose(rolled[1].gaussians.means[3].mean(0), world.mean(0), atol=1e-3)
+    world = np.asarray(posmap.denormalize(avatar.atlas, points, origin))
+    means = np.asarray(rolled[1].gaussians.means[3])
+    if avatar.config.appearance_model == "point_transformer":
+        np.testing.assert_allclose(means.mean(0), world.mean(0), atol=1e-3)
+    else:
+        bound = np.sqrt(3) * avatar.config.texel_head.offset_bound
+        assert 1e-4 < np.linalg.norm(means - world, axis=1).max() < bound + 1e-3
 
 
-def test_info_tells_the_distance_to_the_basis_and_the_lowest_texel(avatar, start, rolled):
-    texels = np.asarray(texels_of(avatar, rolled[1])[0], np.float64)
-    scale, basis = float(avatar.atlas.scale), np.asarray(avatar.pca.basis, np.float64)
-    centred = texels.reshape(-1) - np.asarray(avatar.pca.mean)
-    outside = (centred - basis.T @ (basis @ centred)).reshape(-1, 3) / scale
-    info = rolled[1].info
+def test_info_tells_how_far_alignment_moves_and_the_lowest_texel(avatar, start, rolled):
+    texels = texels_of(avatar, rolled[1])[0]
+    scale, info = float(avatar.atlas.scale), rolled[1].info
+    outside = np.asarray(texels - aligned(avatar, texels), np.float64) / scale
     assert float(info.pca_residual[0]) == pytest.approx(np.sqrt((outside**2).sum(1).mean()), rel=1e-2, abs=1e-4)
-    lowest = (texels[:, 1].min() - 0.5) / scale + float(start.offset[1])
+    assert (info.pca_residual[0] > 1e-3) == (avatar.pca is not None)
+    lowest = (float(texels[:, 1].min()) - 0.5) / scale + float(start.offset[1])
     assert float(info.ground[0]) == pytest.approx(lowest, abs=1e-4)

@@ -9,7 +9,7 @@ import pytest
 
 from avatarjax.posmap import pca
 from avatarjax.train import read_metrics
-from avatarjax.unica import batches, fit, train
+from avatarjax.unica import batches, fit, train, train_appearance
 from avatarjax.unica.config import StageConfig
 
 
@@ -44,7 +44,7 @@ class TestUnet:
             handed.update(batch_at=batch_at, hold=hold, initial=initial)
             return initial
 
-        monkeypatch.setattr(train, "_train", loop)
+        monkeypatch.setattr(train, "train_stage", loop)
         train.train_unet(few, tiny_data, run, latent_dynamics)
         return handed
 
@@ -83,7 +83,7 @@ def test_what_keys_ask_for_is_measured_from_the_data(tiny_data, coefficient_fram
 
 
 def test_base_attributes_learn_the_standing_pose(few, tiny_data, run, upscaler):
-    base = train.train_base(few, tiny_data, run, upscaler)
+    base = train_appearance.train_base(few, tiny_data, run, upscaler)
     values = losses(run, "base")
     assert np.mean(values[-4:]) < 0.9 * np.mean(values[:4])
     assert base.colors.shape == (len(upscaler.rows), 3)

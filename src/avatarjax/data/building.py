@@ -59,7 +59,7 @@ class _Simulated:
         self.faces, self.uvs, self.texture = self.avatar.faces, self.avatar.uvs, self.avatar.texture
         self.cloth = XPBDConfig(substeps=spec.cloth_steps)
         self.scripts = {
-            "train": sequences.transition_scripts(spec.transition_frames, spec.seed),
+            "train": sequences.SCRIPTS[spec.scripts](spec.transition_frames, spec.seed),
             "held_out": sequences.transition_scripts(spec.held_out_frames, spec.seed + 1),
             "truth": [np.asarray(spec.script, np.int32)],
         }

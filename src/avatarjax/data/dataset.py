@@ -41,7 +41,8 @@ _GOLDEN = np.pi * (3 - np.sqrt(5))
 class DatasetSpec:
     """What a dataset is made of; two datasets with equal specs are equal.
 
-    Sequences have `transition_frames` frames, or those of UNICA Table A for None. `vertices` says whether whole meshes
+    Sequences have `transition_frames` frames, or those of UNICA Table A for None; `scripts` says how training sequences
+    press keys: the paper's "transitions" or "chains" (`sequences.SCRIPTS`). `vertices` says whether whole meshes
     are kept, as float16 or float32 relative to the root, and not only the texels of the position maps. `source` names
     recorded meshes from which it is made instead of the simulation (`building.describe`).
     """
@@ -58,6 +59,7 @@ class DatasetSpec:
     script: tuple[int, ...]
     seed: int = 0
     cloth_steps: int = 32
+    scripts: typing.Literal["transitions", "chains"] = "transitions"
     vertices: typing.Literal["none", "float16", "float32"] = "none"
     source: str = ""
 
@@ -66,6 +68,8 @@ class DatasetSpec:
             raise ValueError(
                 f"there are 1 to {VIEWS} views a pose, asked for {self.image_views} and {self.standing_views}"
             )
+        if self.scripts not in sequences.SCRIPTS:
+            raise ValueError(f"training scripts are {' or '.join(sequences.SCRIPTS)}, not {self.scripts!r}")
         if self.vertices not in ("none", "float16", "float32"):
             raise ValueError(f"vertices are kept as none, float16 or float32, not {self.vertices!r}")
 

@@ -22,6 +22,8 @@ from avatarjax.physics import xpbd
 ACTIONS = ("idle", "forward", "backward", "left", "right")
 # Frames under the first key before a sequence begins: simulated, so that the cloth has found its way, but not recorded.
 LEAD_IN = 30
+# Frames, at least and at most, for which a chain holds a key.
+HOLD = (35, 80)
 # Frames of the transition from one action (row) to another (column), in the order of ACTIONS (UNICA Table A).
 TABLE_A = (
     (0, 367, 362, 359, 362),
@@ -84,6 +86,31 @@ def transition_scripts(frames: int | None, seed: int, actions: int = len(ACTIONS
                 turn = length // 3 + int(rng.integers(0, max(1, length // 12)))
                 scripts.append(np.array([source] * turn + [target] * (length - turn), np.int32))
     return scripts
+
+
+def chain_scripts(frames: int | None, seed: int, actions: int = len(ACTIONS)) -> list[Int[np.ndarray, " f"]]:
+    """As many sequences of the same lengths as `transition_scripts`, but a new key every HOLD frames (ours).
+
+    Several times as many turns in the same time. The next key is always that to which the last one has led least often,
+    so that all ordered pairs come equally often. Raises ValueError as `transition_scripts`.
+    """
+    rng = np.random.default_rng(seed)
+    led = np.zeros((actions, actions))
+    np.fill_diagonal(led, np.inf)
+    scripts, key = [], int(rng.integers(actions))
+    for length in (len(script) for script in transition_scripts(frames, seed, actions)):
+        keys = [key] * int(rng.integers(*HOLD, endpoint=True))
+        while len(keys) < length:
+            following = int(rng.choice(np.flatnonzero(led[key] == led[key].min())))
+            led[key, following] += 1
+            key = following
+            keys += [key] * int(rng.integers(*HOLD, endpoint=True))
+        scripts.append(np.array(keys[:length], np.int32))
+    return scripts
+
+
+# How training sequences press keys, by name.
+SCRIPTS = {"transitions": transition_scripts, "chains": chain_scripts}
 
 
 def simulate(

@@ -12,25 +12,34 @@ from avatarjax.posmap.codec import (
     root,
     to_map,
 )
+from avatarjax.posmap.neighbours import around, neighbours
+from avatarjax.posmap.surface import Frames, Tangents, frames, tangents, turns
 from avatarjax.posmap.upscale import Upscaler, build_upscaler, upscale
 
 __all__ = [
     "Atlas",
     "Box",
+    "Frames",
+    "Tangents",
     "Upscaler",
     "Window",
+    "around",
     "bounding_box",
     "build_atlas",
     "build_upscaler",
     "denormalize",
     "encode",
+    "frames",
     "from_map",
     "heading",
     "into_box",
+    "neighbours",
     "normalize",
     "normalize_group",
     "root",
+    "tangents",
     "to_map",
+    "turns",
     "upscale",
     "windows",
 ]

@@ -16,8 +16,10 @@ from avatarjax.unica.appearance import AppearanceConfig
 from avatarjax.unica.coefficients import CoefficientConfig
 from avatarjax.unica.denoiser import DenoiserConfig
 from avatarjax.unica.latent import LatentConfig
+from avatarjax.unica.texel_head import TexelHeadConfig
 from avatarjax.unica.vae import VAEConfig
 
+AppearanceName = typing.Literal["texels", "point_transformer"]
 DynamicsName = typing.Literal["coefficients", "unet"]
 PresetName = typing.Literal["ci", "small", "base", "paper"]
 
@@ -43,12 +45,14 @@ class DataConfig:
     standing_views: int = 50
     image_size: int = 1024
     cloth_steps: int = 32  # ours
+    scripts: typing.Literal["transitions", "chains"] = "transitions"  # ours: chains turn several times as often
     vertices: typing.Literal["none", "float16", "float32"] = "none"  # ours
 
 
 @dataclasses.dataclass(frozen=True)
 class UnicaConfig:
-    """A whole run. `dynamics` names the model behind `step`; the other one is trained too where `train_both` is set."""
+    """A whole run. `dynamics` and `appearance_model` name the models behind `step`; the other two are trained as well
+    where `train_both` is set."""
 
     size: int = 128
     upscaled: int = 1024
@@ -59,7 +63,9 @@ class UnicaConfig:
     data: DataConfig = DataConfig()
     latent: LatentConfig = LatentConfig()
     coefficients: CoefficientConfig = CoefficientConfig()
+    appearance_model: AppearanceName = "point_transformer"
     appearance: AppearanceConfig = AppearanceConfig()
+    texel_head: TexelHeadConfig = TexelHeadConfig()  # ours
     turn_window: tuple[int, int] = (0, 25)  # frames after a key change that count as turning; code: (-5, 40)
     turn_fraction: float = 0.7  # of the second stage's samples
     views_per_step: int = 8
@@ -73,6 +79,7 @@ class UnicaConfig:
     coefficients_stage: StageConfig = StageConfig(30_000, 128, 1e-3, ema=0.998)  # ours
     base_stage: StageConfig = StageConfig(3_000, 8, 1e-2)  # ours
     appearance_stage: StageConfig = StageConfig(15_600, 8, 1e-4)
+    texels_stage: StageConfig = StageConfig(10_000, 8, 5e-3)  # ours
 
     def __post_init__(self):
         side = self.size // self.latent.vae.downsampling
@@ -94,6 +101,7 @@ def _base() -> UnicaConfig:
         unet_stage=StageConfig(90_000, 32, 1e-4),
         base_stage=StageConfig(2_000, 8, 1e-2),
         appearance_stage=StageConfig(8_000, 4, 2e-4),
+        texels_stage=StageConfig(6_000, 4, 5e-3),
     )
 
 
@@ -103,7 +111,15 @@ def _small() -> UnicaConfig:
         upscaled=256,
         pca_components=120,
         dynamics="coefficients",
-        data=DataConfig(transition_frames=300, image_poses=160, image_views=8, standing_views=50, image_size=256),
+        appearance_model="texels",
+        data=DataConfig(
+            transition_frames=300,
+            image_poses=160,
+            image_views=8,
+            standing_views=50,
+            image_size=256,
+            scripts="chains",
+        ),
         latent=LatentConfig(
             vae=VAEConfig(channels=(32, 64, 128), residual_blocks=1, positions=64),
             denoiser=DenoiserConfig(channels=(64, 128, 256), residual_blocks=1, head_width=32, action_features=128),
@@ -134,6 +150,7 @@ def _small() -> UnicaConfig:
         coefficients_stage=StageConfig(6_000, 128, 1e-3, ema=0.998),
         base_stage=StageConfig(400, 4, 2e-2),
         appearance_stage=StageConfig(400, 1, 1e-3),
+        texels_stage=StageConfig(1_000, 1, 5e-3),
     )
 
 
@@ -143,6 +160,7 @@ def _ci() -> UnicaConfig:
         upscaled=128,
         pca_components=64,
         dynamics="coefficients",
+        appearance_model="texels",
         train_both=True,
         data=DataConfig(
             transition_frames=120,
@@ -152,6 +170,7 @@ def _ci() -> UnicaConfig:
             standing_views=50,
             image_size=64,
             cloth_steps=12,
+            scripts="chains",
         ),
         latent=LatentConfig(
             vae=VAEConfig(channels=(16, 32, 32), residual_blocks=1, positions=32),
@@ -185,6 +204,7 @@ def _ci() -> UnicaConfig:
         coefficients_stage=StageConfig(3_000, 128, 2e-3, ema=0.998),
         base_stage=StageConfig(150, 4, 3e-2),
         appearance_stage=StageConfig(300, 1, 2e-3),
+        texels_stage=StageConfig(800, 1, 5e-3),
     )
 
 

@@ -14,7 +14,7 @@ from avatarjax.data.dataset import Dataset
 from avatarjax.posmap import pca as pcs
 from avatarjax.unica import batches, coefficients, latent
 from avatarjax.unica import train as training
-from avatarjax.unica.rollout import Avatar
+from avatarjax.unica.avatar import Avatar
 
 CHUNK = 64
 
@@ -95,15 +95,22 @@ def reconstruction(avatar: Avatar, data: Dataset, chosen: Int[np.ndarray, "g"]) 
 
 
 def components(avatar: Avatar, data: Dataset, chosen: Int[np.ndarray, "g"]) -> dict[int, float]:
-    """Mean error in mm of held-out fourth maps against the number of alignment components kept (UNICA Fig. B)."""
-    scale = float(data.atlas.scale)
-    groups, _ = batches.windows(data.held_out, 4, avatar.config.turn_window).groups(chosen, scale)
-    fourth = groups[:, 3]
-    centred = fourth.reshape(len(fourth), -1) - np.asarray(avatar.pca.mean)
-    basis = np.asarray(avatar.pca.basis)
+    """Mean error in mm of held-out frames against the number of principal components kept (UNICA Fig. B).
+
+    Of the basis that aligns generated maps or, where there is none, of the basis in which they are generated; frames
+    are the fourth ones of chosen groups.
+    """
+    windows = batches.windows(data.held_out, 4, avatar.config.turn_window)
+    if avatar.pca is not None:
+        pca, scale = avatar.pca, float(data.atlas.scale)
+        flat = windows.groups(chosen, scale)[0][:, 3].reshape(len(chosen), -1)
+    else:
+        pca, scale = avatar.dynamics.basis, 1.0
+        flat = training.coefficient_frames(data, data.held_out)[0][windows.frames(chosen)[:, 3]]
+    centred, basis = flat - np.asarray(pca.mean), np.asarray(pca.basis)
     errors = {}
     for count in sorted({1, 2, 4, 8, 16, 32, 64, 120, len(basis)}):
         if count <= len(basis):
-            back = centred @ basis[:count].T @ basis[:count] - centred
-            errors[count] = float(millimetres(back.reshape(fourth.shape), np.zeros_like(fourth), scale).mean())
+            back = (centred @ basis[:count].T @ basis[:count] - centred).reshape(len(centred), -1, 3)
+            errors[count] = float(millimetres(back, np.zeros_like(back), scale).mean())
     return errors

@@ -7,18 +7,22 @@ import os
 import typing
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from avatarjax.io import weights
-from avatarjax.posmap import Atlas, Upscaler
+from avatarjax.posmap import Atlas, build_upscaler, tangents
 from avatarjax.posmap.pca import PCA
 from avatarjax.unica.appearance import BaseAttributes
+from avatarjax.unica.avatar import Avatar
 from avatarjax.unica.coefficients import CoefficientDynamics, Scaling
 from avatarjax.unica.config import PRESETS, DynamicsName, UnicaConfig
 from avatarjax.unica.latent import LatentDynamics
-from avatarjax.unica.rollout import Avatar
 
-VERSION = 1
+VERSION = 2
+# Stored in half precision on request: what is learned. The atlas, in which half a millimetre counts, is not.
+_LEARNED = ("pca", "base", "appearance", "dynamics")
 
 
 def file_name(dynamics: str) -> str:
@@ -26,9 +30,21 @@ def file_name(dynamics: str) -> str:
     return f"avatar-{dynamics}.safetensors"
 
 
-def save(path: str | os.PathLike, avatar: Avatar) -> None:
-    """Write an avatar atomically."""
-    weights.save_tree(path, avatar, version=VERSION, config=dataclasses.asdict(avatar.config))
+def save(path: str | os.PathLike, avatar: Avatar, *, half: bool = False, **metadata: typing.Any) -> None:
+    """Write an avatar atomically; `half` stores what was learned as float16. Upscaler and tangents are not stored:
+    they follow from the atlas. `metadata`, as JSON, goes into the header."""
+    tree = {
+        f.name: getattr(avatar, f.name)
+        for f in dataclasses.fields(avatar)
+        if f.name not in ("upscaler", "tangents", "config") and getattr(avatar, f.name) is not None
+    }
+    if half:
+        tree |= {name: jax.tree.map(_halve, tree[name]) for name in _LEARNED if name in tree}
+    weights.save_tree(path, tree, **metadata, version=VERSION, config=dataclasses.asdict(avatar.config))
+
+
+def _halve(x: jax.Array) -> jax.Array:
+    return x.astype(jnp.float16) if x.dtype == jnp.float32 else x
 
 
 def load(
@@ -62,6 +78,7 @@ def _read(path: Path) -> Avatar:
         raise ValueError(f"{path} holds no avatar of version {VERSION}: train it again")
     try:
         config = from_dict(UnicaConfig, metadata["config"])
+        arrays = {k: v.astype(np.float32) if v.dtype == np.float16 else v for k, v in arrays.items()}
         tree = weights.nest({name: jnp.asarray(value) for name, value in arrays.items()})
         dynamics = tree["dynamics"]
         if "vae" in dynamics:
@@ -69,10 +86,12 @@ def _read(path: Path) -> Avatar:
         else:
             dynamics = dynamics | {"basis": PCA(**dynamics["basis"]), "scaling": Scaling(**dynamics["scaling"])}
             dynamics = CoefficientDynamics(**dynamics)
+        atlas = Atlas(**tree["atlas"], size=config.size)
         return Avatar(
-            atlas=Atlas(**tree["atlas"], size=config.size),
-            upscaler=Upscaler(**tree["upscaler"], size=config.upscaled),
-            pca=PCA(**tree["pca"]),
+            atlas=atlas,
+            upscaler=build_upscaler(atlas, config.upscaled),
+            tangents=tangents(atlas),
+            pca=PCA(**tree["pca"]) if isinstance(dynamics, LatentDynamics) else None,
             base=BaseAttributes(**tree["base"]),
             appearance=tree["appearance"],
             dynamics=dynamics,

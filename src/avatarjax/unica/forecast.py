@@ -12,8 +12,9 @@ from avatarjax.data.sequences import Recording
 from avatarjax.posmap import Atlas
 from avatarjax.posmap import pca as pcs
 from avatarjax.unica import coefficients
+from avatarjax.unica.avatar import Avatar
 from avatarjax.unica.latent import LatentDynamics
-from avatarjax.unica.rollout import Avatar, Frame, State, rollout
+from avatarjax.unica.rollout import Frame, State, rollout
 
 
 def state_at(

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 from tqdm import tqdm
 
+from avatarjax import posmap
 from avatarjax.cameras import Camera
 from avatarjax.data.dataset import Images, cardinal_cameras, cylinder_cameras
 from avatarjax.data.sequences import Recording
@@ -23,9 +24,10 @@ from avatarjax.gaussians import Gaussians
 from avatarjax.metrics import image, lpips
 from avatarjax.splat import SplatConfig, render
 from avatarjax.unica import appearance, photometric
+from avatarjax.unica.avatar import Avatar, in_box, wear, wear_base
 from avatarjax.unica.forecast import state_at
-from avatarjax.unica.rollout import Avatar, Frame, step
-from avatarjax.unica.train import boxed_points
+from avatarjax.unica.rollout import Frame, step
+from avatarjax.unica.train_appearance import boxed_points
 
 CONTEXT = 3
 
@@ -47,11 +49,9 @@ def appearance_quality(
 
     @jax.jit
     def drawn(avatar, texels, views):
-        points, side = boxed_points(avatar.upscaler, texels)
-        cloud = appearance.coarse_gaussians(avatar.base, points, side)
-        if refined:
-            cloud = appearance.refine(avatar.config.appearance, avatar.appearance, cloud)
-        return _draw(cloud, views, splat)
+        cloud = wear(avatar, texels) if refined else wear_base(avatar, texels)
+        box = posmap.bounding_box(posmap.upscale(avatar.upscaler, texels))
+        return _draw(in_box(cloud, box), views, splat)
 
     poses = zip(images.texels, images.view, images.rgba, strict=True)
     return _judge(

@@ -16,32 +16,10 @@ from jaxtyping import Array, Float, Int, Key
 
 from avatarjax import posmap
 from avatarjax.gaussians import Gaussians
-from avatarjax.nets.functional import Params
-from avatarjax.posmap import Atlas, Upscaler
 from avatarjax.posmap import pca as pcs
-from avatarjax.unica import align, appearance, coefficients, latent
-from avatarjax.unica.coefficients import CoefficientDynamics
-from avatarjax.unica.config import UnicaConfig
+from avatarjax.unica import coefficients, latent
+from avatarjax.unica.avatar import Avatar, wear
 from avatarjax.unica.latent import LatentDynamics
-
-
-@typing.no_type_check
-@flax.struct.dataclass
-class Avatar:
-    """Everything that a trained avatar is.
-
-    `standing` (t, 3) are the texels of the standing pose in metres with the root above the world's origin; `pca` is the
-    basis of normalised fourth maps. `dynamics` is either of the two models; `config` is static.
-    """
-
-    atlas: Atlas
-    upscaler: Upscaler
-    pca: pcs.PCA
-    base: appearance.BaseAttributes
-    appearance: Params
-    dynamics: CoefficientDynamics | LatentDynamics
-    standing: Float[Array, "t 3"]
-    config: UnicaConfig = flax.struct.field(pytree_node=False)
 
 
 @typing.no_type_check
@@ -61,7 +39,7 @@ class State:
 @typing.no_type_check
 @flax.struct.dataclass
 class Info:
-    """What a user may want to watch: distance of the generated texels to the PCA span and the lowest texel's height.
+    """What a user may want to watch: how far alignment moved the generated texels, and the lowest texel's height.
 
     pca_residual () root mean square in metres; ground () metres, 0 for a foot on the floor: a trend is vertical drift.
     """
@@ -116,15 +94,16 @@ def rollout(
 
 
 def dress(avatar: Avatar, frame: Frame) -> Gaussians:
-    """World Gaussians of a frame's geometry: PCA, upscaling, appearance network, Procrustes fit."""
+    """World Gaussians of a frame's geometry."""
     texels = posmap.from_map(avatar.atlas, frame.posmap)
     # The map is normalised about the root of the frame before; its own root tells where that is in the world.
     origin = frame.root - (posmap.root(avatar.atlas, texels) - 0.5) / avatar.atlas.scale
-    points = posmap.upscale(avatar.upscaler, pcs.align(avatar.pca, texels))
-    box = posmap.bounding_box(points)
-    coarse = appearance.coarse_gaussians(avatar.base, posmap.into_box(box, points), box.side / avatar.atlas.scale)
-    refined = appearance.refine(avatar.config.appearance, avatar.appearance, coarse)
-    return align.place(refined, posmap.denormalize(avatar.atlas, points, origin))
+    return wear(avatar, posmap.denormalize(avatar.atlas, _aligned(avatar, texels), origin))
+
+
+def _aligned(avatar: Avatar, texels: Float[Array, "t 3"]) -> Float[Array, "t 3"]:
+    """Normalised texels whose six views agree."""
+    return texels if avatar.pca is None else pcs.align(avatar.pca, texels)
 
 
 def _step(avatar: Avatar, state: State, action: Int[Array, ""], gaussians: bool) -> tuple[State, Frame]:
@@ -134,7 +113,7 @@ def _step(avatar: Avatar, state: State, action: Int[Array, ""], gaussians: bool)
 
     # Movement accumulation (Eq. 7): in the shared space of the group, the root has moved from 0.5 to here.
     root = state.offset + (posmap.root(avatar.atlas, texels) - 0.5) / avatar.atlas.scale
-    residual = (texels - pcs.align(avatar.pca, texels)) / avatar.atlas.scale
+    residual = (texels - _aligned(avatar, texels)) / avatar.atlas.scale
     info = Info(
         pca_residual=jnp.sqrt(jnp.mean(jnp.sum(residual**2, axis=-1))),
         ground=jnp.min(texels[:, 1] - 0.5) / avatar.atlas.scale + state.offset[1],

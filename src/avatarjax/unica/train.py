@@ -1,4 +1,4 @@
-"""The trained stages of UNICA (3.6, B.1, C.2), each one jitted step inside the common loop.
+"""The trained stages of UNICA's dynamics (3.6, C.2), each one jitted step inside the common loop.
 
 Every function takes the config, the dataset and a `Run` (where checkpoints go, and the seed), resumes what it finds
 there, and returns plain arrays. Weights that a stage does not train travel with the batch: closed over, they
@@ -18,16 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from avatarjax import posmap
 from avatarjax.data import sequences
-from avatarjax.data.dataset import Dataset, cylinder_cameras
-from avatarjax.metrics import lpips
+from avatarjax.data.dataset import Dataset
 from avatarjax.nets import functional
 from avatarjax.nets.functional import Params
 from avatarjax.posmap import pca as pcs
 from avatarjax.train import TrainState, fit, make_step, new_state, weights
 from avatarjax.train.state import Loss, optimiser
-from avatarjax.unica import appearance, batches, coefficients, latent, photometric
+from avatarjax.unica import batches, coefficients, latent
 from avatarjax.unica import fit as closed_form
 from avatarjax.unica.coefficients import CoefficientDenoiser, CoefficientDynamics, Context
 from avatarjax.unica.config import StageConfig, UnicaConfig
@@ -49,7 +47,7 @@ class Run:
         return jax.random.fold_in(jax.random.key(self.seed), int(hashlib.sha256(stage.encode()).hexdigest()[:7], 16))
 
 
-def _train(
+def train_stage(
     run: Run,
     name: str,
     stage: StageConfig,
@@ -108,7 +106,7 @@ def train_vae(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamic
         dynamics = batch["frozen"].replace(vae=params)
         return latent.vae_loss(config.latent, batch["atlas"], dynamics, key, batch["texels"])
 
-    trained = start.replace(vae=_train(run, "vae", stage, config.latent, loss, start.vae, batch_at))
+    trained = start.replace(vae=train_stage(run, "vae", stage, config.latent, loss, start.vae, batch_at))
     groups = _sample_groups(config, data, 64)
     encode = jax.jit(functools.partial(latent.encode, config.latent))
     mean, spread = closed_form.latent_statistics(encode(data.atlas, trained, groups.reshape(-1, *groups.shape[2:])))
@@ -151,7 +149,7 @@ def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynami
         table = jnp.where(batch["learn_actions"], new["action_table"]["embedding"], old["action_table"]["embedding"])
         return {**new, "action_table": {"embedding": table}}
 
-    return start.replace(denoiser=_train(run, "unet", stage, settings, loss, start.denoiser, batch_at, hold))
+    return start.replace(denoiser=train_stage(run, "unet", stage, settings, loss, start.denoiser, batch_at, hold))
 
 
 def coefficient_frames(data: Dataset, recording: typing.Any) -> tuple[np.ndarray, np.ndarray]:
@@ -244,7 +242,7 @@ def train_coefficients(config: UnicaConfig, data: Dataset, run: Run) -> Coeffici
         roll_loss = jax.lax.cond(batch["rolling"], rolled, lambda _: single_loss, None)
         return 0.5 * (single_loss + roll_loss), {"single": single_loss, "rollout": roll_loss}
 
-    params = _train(run, "coefficients", stage, settings, loss, linear, batch_at)
+    params = train_stage(run, "coefficients", stage, settings, loss, linear, batch_at)
     return start.replace(params=params)
 
 
@@ -255,103 +253,3 @@ def fit_alignment(config: UnicaConfig, data: Dataset, run: Run) -> pcs.PCA:
     shift = data.train.roots[frames[:, 3]] - data.train.roots[frames[:, 2]]
     fourth = batches.frame_images(data.train.texels[frames[:, 3]], shift, float(data.atlas.scale))
     return closed_form.alignment_basis(jnp.asarray(fourth), config.pca_components, run.key("pca"))
-
-
-def boxed_points(upscaler: posmap.Upscaler, texels: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Upscaled points (n, 3) of a pose in its box, and the box' side in the texels' unit (UNICA B.1)."""
-    points = posmap.upscale(upscaler, texels)
-    box = posmap.bounding_box(points)
-    return posmap.into_box(box, points), box.side
-
-
-def train_base(
-    config: UnicaConfig,
-    data: Dataset,
-    run: Run,
-    upscaler: posmap.Upscaler,
-    perceptual: lpips.Network | None = None,
-) -> appearance.BaseAttributes:
-    """The base attribute map on the standing pose's 50 views, with frozen means (UNICA B.1).
-
-    Without a `perceptual` network the loss has no LPIPS term.
-    """
-    stage, images = config.base_stage, data.standing_images
-    cameras = cylinder_cameras(images.rgba.shape[-2])
-    points, side = boxed_points(upscaler, jnp.asarray(images.texels[0]))
-    start = appearance.initial_base(points, side)
-    splat = photometric.splat_config(appearance.coarse_gaussians(start, points, side), cameras)
-
-    def batch_at(step):
-        rng = batches.generator(run.seed, step)
-        slots = rng.choice(images.view.shape[1], min(stage.batch, images.view.shape[1]), replace=False)
-        return {
-            "points": points,
-            "height": side,
-            "perceptual": perceptual,
-            "views": photometric.pick_views(cameras, images.view[0, slots]),
-            "rgba": images.rgba[0, slots],
-            "white": np.float32(rng.integers(2)),
-        }
-
-    def loss(params, key, batch):
-        base = appearance.BaseAttributes(**params, height=batch["height"])
-        cloud = appearance.coarse_gaussians(base, batch["points"], batch["height"])
-        return photometric.loss(
-            config, cloud, batch["views"], batch["rgba"], batch["white"], splat, batch["perceptual"]
-        )
-
-    initial = {name: getattr(start, name) for name in ("log_scales", "quats", "logit_opacities", "colors")}
-    settings = photometric.settings(config, perceptual)
-    trained = _train(run, "base", stage, settings, loss, initial, batch_at)
-    return start.replace(**trained)
-
-
-def train_appearance(
-    config: UnicaConfig,
-    data: Dataset,
-    run: Run,
-    upscaler: posmap.Upscaler,
-    base: appearance.BaseAttributes,
-    perceptual: lpips.Network | None = None,
-) -> Params:
-    """The point transformer on training poses and random views of each (UNICA B.1, C.2).
-
-    Without a `perceptual` network the loss has no LPIPS term.
-    """
-    stage, images = config.appearance_stage, data.train_images
-    cameras = cylinder_cameras(images.rgba.shape[-2])
-    points, side = boxed_points(upscaler, jnp.asarray(images.texels[0]))
-    splat = photometric.splat_config(appearance.coarse_gaussians(base, points, side), cameras)
-    k = min(config.views_per_step, images.view.shape[1])
-
-    def batch_at(step):
-        rng = batches.generator(run.seed, step)
-        poses = rng.choice(len(images.texels), stage.batch, replace=len(images.texels) < stage.batch)
-        slots = np.stack([rng.permutation(images.view.shape[1])[:k] for _ in poses])
-        return {
-            "upscaler": upscaler,
-            "base": base,
-            "perceptual": perceptual,
-            "texels": images.texels[poses],
-            "views": photometric.pick_views(cameras, images.view[poses[:, None], slots]),
-            "rgba": images.rgba[poses[:, None], slots],
-            "white": rng.integers(0, 2, stage.batch).astype(np.float32),
-        }
-
-    def loss(params, key, batch):
-        def dressed(texels):
-            points, side = boxed_points(batch["upscaler"], texels)
-            coarse = appearance.coarse_gaussians(batch["base"], points, side)
-            return appearance.refine(config.appearance, params, coarse)
-
-        # The network runs outside the loop over poses: inside one, XLA's CPU backend uses a single core.
-        clouds = jax.vmap(dressed)(batch["texels"])
-        value, metrics = jax.lax.map(
-            lambda pose: photometric.loss(config, *pose, splat, batch["perceptual"]),
-            (clouds, batch["views"], batch["rgba"], batch["white"]),
-        )
-        return jnp.mean(value), jax.tree.map(jnp.mean, metrics)
-
-    initial = functional.init(appearance.AppearanceNetwork, config.appearance, run.key("appearance"))
-    settings = (config.appearance, config.base_stage, config.views_per_step, *photometric.settings(config, perceptual))
-    return _train(run, "appearance", stage, settings, loss, initial, batch_at)
