@@ -1,6 +1,7 @@
 """Train an avatar that answers W/A/S/D, roll it out, and report: UNICA from simulated data to video.
 
-    python -m experiments.unica --avatar cowgirl               # preset small, the default on a CPU
+    python -m experiments.unica --avatar cowgirl               # shows the shipped avatar, where there is one
+    python -m experiments.unica --avatar cowgirl --train       # trains it: preset small, the default on a CPU
     python -m experiments.unica --avatar cowgirl --preset ci   # everything, both dynamics models, in minutes
     python -m experiments.unica --avatar cowgirl --dynamics unet --appearance point_transformer   # the paper's parts
     python -m experiments.unica --avatar cowgirl --stage report
@@ -21,22 +22,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 import tyro
 
 from avatarjax import posmap, unica
 from avatarjax.data import MeshSequence, avatars, building, dataset, load_mesh_sequence
-from avatarjax.io import atomic, exr, ply, video
+from avatarjax.io import atomic
 from avatarjax.metrics import lpips, pretrained
 from avatarjax.train import read_metrics
 from avatarjax.unica import files, train, train_appearance
 from avatarjax.unica.config import AppearanceName, DynamicsName, UnicaConfig
-from experiments import pictures, unica_report
+from experiments import pictures, unica_report, unica_shipped
+from experiments.unica_rollout import SCRIPT, roll_and_draw
 
 STAGES = ("data", "vae", "unet", "coefficients", "pca", "base", "appearance", "texels", "rollout", "report")
-SCRIPT = (1,) * 60 + (2,) * 60 + (3,) * 60 + (0,) * 20  # UNICA C.4: 60 W, 60 S, 60 A, 20 idle
-ROLLOUT_CHUNK = 20
 
 
 @dataclasses.dataclass
@@ -49,6 +47,8 @@ class Args:
     """Train on your own mesh sequence instead: what avatarjax.data.load_mesh_sequence reads (docs/data_import.md)."""
     axes: str | None = None
     """Axes of --meshes: gltf, blender, unreal or unreal-mesh. Default: told from the first frame."""
+    train: bool = False
+    """Train from scratch, also an avatar whose weights are shipped; any option but --avatar and --out means it too."""
     preset: str = ""
     """Sizes: ci, small, base or paper. Without it, small on a CPU and base on an accelerator."""
     dynamics: DynamicsName | None = None
@@ -118,7 +118,10 @@ class Experiment:
 
 
 def run_experiment(args: Args) -> Path:
-    """Run the stages that `args` ask for; returns the folder of the results."""
+    """Run the stages that `args` ask for, or show a shipped avatar; returns the folder of the results."""
+    shipped = files.shipped().get(args.avatar)
+    if shipped is not None and args == Args(avatar=args.avatar, out=args.out):
+        return unica_shipped.show(args.avatar, shipped, args.out / "unica" / args.avatar / "shipped")
     experiment = prepare(args)
     folder, config = experiment.folder, experiment.config
     wanted = experiment.stages() if args.stage == "all" else [args.stage]
@@ -172,7 +175,7 @@ def run_experiment(args: Args) -> Path:
         name: assemble(config, data, upscaler, trained, config.dynamics, name) for name in experiment.appearances
     }
     announce("rollout", f"{len(SCRIPT)} frames, four views each")
-    frames = timed(experiment, "rollout", lambda: roll_and_draw(experiment, avatar))
+    frames = timed(experiment, "rollout", lambda: roll_and_draw(avatar, SCRIPT, folder, args.seed))
     if last == experiment.stages().index("report"):
         announce("report", "measuring against held-out data")
         timed(
@@ -274,30 +277,6 @@ def assemble(
         standing=data.standing,
         config=dataclasses.replace(config, dynamics=dynamics, appearance_model=appearance),
     )
-
-
-def roll_and_draw(experiment: Experiment, avatar: unica.Avatar) -> unica.Frame:
-    """Roll the script out and write video, contact sheet and one frame's Gaussians; returns the frames."""
-    from tqdm import tqdm
-
-    folder = experiment.folder
-    roll = jax.jit(unica.rollout)
-    state = unica.reset(avatar, jax.random.fold_in(jax.random.key(experiment.args.seed), 7))
-    parts = []
-    for start in tqdm(range(0, len(SCRIPT), ROLLOUT_CHUNK), desc="rollout", unit=f"{ROLLOUT_CHUNK} frames"):
-        state, frames = roll(avatar, state, jnp.asarray(SCRIPT[start : start + ROLLOUT_CHUNK]))
-        parts.append(jax.device_get(frames))
-    frames = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    if not all(np.isfinite(x).all() for x in jax.tree.leaves(frames.gaussians)):
-        raise FloatingPointError("the rollout has Gaussians that are not finite: train longer, or lower the rates")
-
-    size = experiment.config.data.image_size
-    views = list(pictures.draw_frames(jax.tree.map(jnp.asarray, frames.gaussians), frames.root, size))
-    video.write_video(folder / "video.mp4", (np.concatenate(list(v), axis=1) for v in views))
-    exr.write_png(folder / "contact_sheet.png", pictures.contact_sheet(views, pictures.key_frames(SCRIPT)))
-    cloud = jax.tree.map(lambda x: jnp.asarray(x[len(SCRIPT) // 2]), frames.gaussians)
-    ply.write_ply(folder / "frame.ply", cloud)
-    return frames
 
 
 def main(argv: list[str] | None = None) -> int:

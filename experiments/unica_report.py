@@ -23,6 +23,7 @@ from avatarjax.unica import batches, evaluate, forecast, image_quality
 from avatarjax.unica.appearance import BaseAttributes
 from avatarjax.unica.config import AppearanceName
 from experiments import pictures, unica_images, unica_motion, unica_motion_page
+from experiments.unica_rollout import before_each_action
 
 if typing.TYPE_CHECKING:
     from experiments.unica import Experiment
@@ -47,7 +48,7 @@ def write(
     avatar = built[driver]
     plain = avatar.replace(base=base)
     yaw, moves = unica_motion.asked(data, experiment.config.actions)
-    paths = {driver: _before_each_action(avatar, np.asarray(frames.root))}
+    paths = {driver: before_each_action(avatar, np.asarray(frames.root))}
     paths |= {name: _path(one, script, seed) for name, one in built.items() if name != driver}
     truth = np.asarray(data.truth.roots)
     answers = {name: responsiveness.responses(p, np.asarray(script), yaw, moves) for name, p in paths.items()}
@@ -227,13 +228,7 @@ def _plain(tree: typing.Any) -> typing.Any:
 def _path(avatar: unica.Avatar, script: tuple[int, ...], seed: int) -> np.ndarray:
     roll = jax.jit(unica.rollout, static_argnames="gaussians")
     state = unica.reset(avatar, jax.random.fold_in(jax.random.key(seed), 7))
-    return _before_each_action(avatar, np.asarray(roll(avatar, state, jnp.asarray(script), gaussians=False)[1].root))
-
-
-def _before_each_action(avatar: unica.Avatar, roots: np.ndarray) -> np.ndarray:
-    """Roots (f, 3) at the frames where each action sets in, as recordings have them, from those after each action."""
-    start = unica.reset(avatar, jax.random.key(0)).offset
-    return np.concatenate([np.asarray(start)[None], roots[:-1]])
+    return before_each_action(avatar, np.asarray(roll(avatar, state, jnp.asarray(script), gaussians=False)[1].root))
 
 
 def _nearest(avatar: unica.Avatar, data: Dataset, frames: unica.Frame) -> dict[str, np.ndarray]:

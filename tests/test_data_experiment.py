@@ -3,13 +3,12 @@
 import json
 import shutil
 
-import jax
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 
 from avatarjax.data import dataset
 from avatarjax.io import exr
 from experiments import data
+from tests.caching import cache_restored
 
 
 @pytest.fixture(scope="module")
@@ -18,13 +17,9 @@ def run(tiny_folder, tiny_spec, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs")
     folder = out / "data" / "cowgirl" / "ci"
     shutil.copytree(tiny_folder, folder / "dataset")
-    cached = jax.config.jax_compilation_cache_dir
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, cache_restored():
         patch.setattr(data, "spec", lambda *_: tiny_spec)
         assert data.main(["--avatar", "cowgirl", "--preset", "ci", "--out", str(out)]) == 0
-    jax.config.update("jax_compilation_cache_dir", cached)
-    # Once opened the cache stays in use for all that follows, whatever the configuration says.
-    compilation_cache.reset_cache()
     return folder
 
 

@@ -21,6 +21,7 @@ from avatarjax.unica.config import PRESETS, DynamicsName, UnicaConfig
 from avatarjax.unica.latent import LatentDynamics
 
 VERSION = 2
+SHIPPED = Path(__file__).parent.parent / "assets" / "avatars"
 # Stored in half precision on request: what is learned. The atlas, in which half a millimetre counts, is not.
 _LEARNED = ("pca", "base", "appearance", "dynamics")
 
@@ -43,6 +44,11 @@ def save(path: str | os.PathLike, avatar: Avatar, *, half: bool = False, **metad
     weights.save_tree(path, tree, **metadata, version=VERSION, config=dataclasses.asdict(avatar.config))
 
 
+def shipped() -> dict[str, Path]:
+    """The trained avatars that come with the package, by name: `small` ones, made by `experiments.ship`."""
+    return {path.stem: path for path in sorted(SHIPPED.glob("*.safetensors"))}
+
+
 def _halve(x: jax.Array) -> jax.Array:
     return x.astype(jnp.float16) if x.dtype == jnp.float32 else x
 
@@ -50,11 +56,12 @@ def _halve(x: jax.Array) -> jax.Array:
 def load(
     source: str | os.PathLike, *, dynamics: DynamicsName | None = None, runs: str | os.PathLike = "runs"
 ) -> Avatar:
-    """A trained avatar from a file, a run folder, or by name from the folders that `experiments.unica` wrote.
+    """A trained avatar from a file, a run folder, or by name: your own from `experiments.unica`, or a shipped one.
 
-    By name, presets are searched from the largest to the smallest under `runs`/unica/NAME/. `dynamics` asks for one of
-    the two models; otherwise the coefficient model is taken where a run has both. Raises ValueError where nothing is
-    there, with the command that trains it, and for files that are damaged or of another version.
+    By name, presets are searched from the largest to the smallest under `runs`/unica/NAME/, then what the package ships
+    (`shipped`). `dynamics` asks for one of the two models; otherwise the coefficient model is taken where a run has
+    both. Raises ValueError where nothing is there, with the command that trains it, and for files that are damaged or
+    of another version.
     """
     path = Path(source)
     if path.is_file():
@@ -66,16 +73,20 @@ def load(
         for name in (dynamics,) if dynamics else typing.get_args(DynamicsName):
             if (folder / file_name(name)).is_file():
                 return _read(folder / file_name(name))
+    known = shipped()
+    if str(source) in known and dynamics in (None, "coefficients"):
+        return _read(known[str(source)])
     raise ValueError(
-        f"no trained avatar {str(source)!r}: neither a file, nor a run folder, nor under {Path(runs) / 'unica'}. "
-        f"Train it with: python -m experiments.unica --avatar {path.name}"
+        f"no trained avatar {str(source)!r}: neither a file, nor a run folder, nor under {Path(runs) / 'unica'}, nor "
+        f"shipped ({', '.join(known) or 'none is'}). "
+        f"Train it with: python -m experiments.unica --avatar {path.name} --train"
     )
 
 
 def _read(path: Path) -> Avatar:
     arrays, metadata = weights.load_arrays(path)
     if metadata.get("version") != VERSION:
-        raise ValueError(f"{path} holds no avatar of version {VERSION}: train it again")
+        raise ValueError(f"{path} holds no avatar of version {VERSION}: train it again, with --train")
     try:
         config = from_dict(UnicaConfig, metadata["config"])
         arrays = {k: v.astype(np.float32) if v.dtype == np.float16 else v for k, v in arrays.items()}
