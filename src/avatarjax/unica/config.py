@@ -72,6 +72,7 @@ class UnicaConfig:
     loss_l1: float = 0.8  # ours; 3DGS' weights, the paper gives none
     loss_ssim: float = 0.2
     loss_lpips: float = 0.1  # ours; 0 or weights that were not fetched: no such term
+    lpips_views: int = 8  # of a step's views, those that LPIPS looks at; ours: the others spare its cost
     lpips_network: typing.Literal["alex", "vgg"] = "vgg"  # ours; the paper names none
     vae_stage: StageConfig = StageConfig(300_000, 32, 1.5e-5)
     unet_stage: StageConfig = StageConfig(300_000, 32, 5e-5)
@@ -144,13 +145,14 @@ def _small() -> UnicaConfig:
             offset_bound=0.05,
         ),
         views_per_step=4,
+        lpips_views=1,
         lpips_network="alex",
         vae_stage=StageConfig(3_000, 16, 3e-3),
         unet_stage=StageConfig(4_500, 8, 3e-4),
         coefficients_stage=StageConfig(6_000, 128, 1e-3, ema=0.998),
-        base_stage=StageConfig(400, 4, 2e-2),
+        base_stage=StageConfig(200, 4, 2e-2),
         appearance_stage=StageConfig(400, 1, 1e-3),
-        texels_stage=StageConfig(1_000, 1, 5e-3),
+        texels_stage=StageConfig(800, 1, 5e-3),
     )
 
 
@@ -198,6 +200,7 @@ def _ci() -> UnicaConfig:
             offset_bound=0.05,
         ),
         views_per_step=4,
+        lpips_views=1,
         lpips_network="alex",
         vae_stage=StageConfig(1_000, 8, 5e-3),
         unet_stage=StageConfig(700, 8, 1e-3),

@@ -46,7 +46,9 @@ def loss(
         "dropped": jnp.sum(dropped).astype(jnp.float32),
     }
     if perceptual is not None:
-        metrics["lpips"] = jnp.mean(lpips.distance(perceptual, images, truth))
+        # Views come in random order: the first few are a fair sample.
+        few = slice(config.lpips_views)
+        metrics["lpips"] = jnp.mean(lpips.distance(perceptual, images[few], truth[few]))
         value = value + config.loss_lpips * metrics["lpips"]
     return value, metrics
 
@@ -54,7 +56,9 @@ def loss(
 def settings(config: UnicaConfig, perceptual: lpips.Network | None) -> tuple[typing.Any, ...]:
     """All that the loss depends on beside its inputs, by which checkpoints know what they were trained with."""
     weights = (config.loss_l1, config.loss_ssim)
-    return weights if perceptual is None else (*weights, config.loss_lpips, perceptual.name)
+    if perceptual is None:
+        return weights
+    return (*weights, config.loss_lpips, config.lpips_views, perceptual.name)
 
 
 def over(rgba: UInt8[Array | np.ndarray, "*b h w 4"], white: Float[Array, ""] | float) -> Float[Array, "*b h w 3"]:
