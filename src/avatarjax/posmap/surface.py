@@ -8,7 +8,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from avatarjax import rotations
 from avatarjax.posmap.atlas import Atlas
@@ -29,7 +29,7 @@ class Tangents:
     neighbour along the row or the column.
     """
 
-    neighbours: typing.Any
+    neighbours: Int[Array, "t 9"]
     across: Float[Array, "t 9"]
     down: Float[Array, "t 9"]
 
