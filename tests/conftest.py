@@ -1,6 +1,8 @@
 """Strict by default: every public shape annotation is checked, rank promotion and warnings are errors."""
 
+import gc
 import os
+from pathlib import Path
 
 import jaxtyping
 
@@ -20,6 +22,19 @@ jax.config.update("jax_compilation_cache_dir", os.environ.get("AVATARJAX_TEST_CA
 def key():
     """A PRNG key; split it where more than one is needed."""
     return jax.random.key(0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_mappings():
+    """Forget compiled functions after a module once they hold many of the memory mappings that a process may have.
+
+    Linux allows 65,530; XLA crashes where it gets no more, which all tests in one process come close to.
+    """
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
