@@ -19,9 +19,9 @@ import numpy as np
 import tyro
 
 from avatarjax import unica
-from avatarjax.metrics import environment, responsiveness
+from avatarjax.metrics import environment
 from avatarjax.unica import files
-from experiments.unica_rollout import SCRIPT, before_each_action
+from experiments.unica_rollout import SCRIPT, answers, before_each_action
 
 # A shipped avatar may be off its course by so many degrees more than the one it was made from.
 _WORSE = 1.0
@@ -32,9 +32,7 @@ def headings(avatar: unica.Avatar) -> np.ndarray:
     state = unica.reset(avatar, jax.random.key(7))
     frames = jax.jit(unica.rollout, static_argnames="gaussians")(avatar, state, jnp.asarray(SCRIPT), gaussians=False)[1]
     roots = before_each_action(avatar, np.asarray(frames.root))
-    yaw, moves = (np.asarray(x, np.float64) for x in (avatar.dynamics.action_yaw, avatar.dynamics.action_moves))
-    answers = responsiveness.responses(roots, np.asarray(SCRIPT), yaw, moves)
-    return np.array([r["heading_error"] for r in answers if "heading_error" in r])
+    return np.array([r["heading_error"] for r in answers(avatar, roots, SCRIPT) if "heading_error" in r])
 
 
 def ship(run: Path, /, seed: int = 0) -> Path:

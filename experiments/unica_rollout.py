@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import typing
 from pathlib import Path
 
 import jax
@@ -11,6 +12,7 @@ from tqdm import tqdm
 
 from avatarjax import unica
 from avatarjax.io import exr, ply, video
+from avatarjax.metrics import responsiveness
 from experiments import pictures
 
 SCRIPT = (1,) * 60 + (2,) * 60 + (3,) * 60 + (0,) * 20  # UNICA C.4: 60 W, 60 S, 60 A, 20 idle
@@ -42,3 +44,9 @@ def before_each_action(avatar: unica.Avatar, roots: np.ndarray) -> np.ndarray:
     """Roots (f, 3) at the frames where each action sets in, as recordings have them, from those after each action."""
     start = unica.reset(avatar, jax.random.key(0)).offset
     return np.concatenate([np.asarray(start)[None], roots[:-1]])
+
+
+def answers(avatar: unica.Avatar, roots: np.ndarray, script: tuple[int, ...]) -> list[dict[str, typing.Any]]:
+    """How root paths (f, 3), as `before_each_action` gives them, answer what the avatar knows its keys to ask for."""
+    yaw, moves = (np.asarray(x, np.float64) for x in (avatar.dynamics.action_yaw, avatar.dynamics.action_moves))
+    return responsiveness.responses(roots, np.asarray(script), yaw, moves)

@@ -16,7 +16,7 @@ from avatarjax.io import weights
 from avatarjax.metrics import responsiveness
 from avatarjax.metrics.report import Report
 from experiments import pictures
-from experiments.unica_rollout import SCRIPT, before_each_action, roll_and_draw
+from experiments.unica_rollout import SCRIPT, answers, before_each_action, roll_and_draw
 
 
 def show(name: str, path: Path, folder: Path) -> Path:
@@ -29,15 +29,13 @@ def show(name: str, path: Path, folder: Path) -> Path:
     frames = roll_and_draw(avatar, SCRIPT, folder, 0)
     paths = before_each_action(avatar, np.asarray(frames.root))
     pictures.plot_paths(folder / "path.png", {"rollout": paths})
-    yaw, moves = (np.asarray(x, np.float64) for x in (avatar.dynamics.action_yaw, avatar.dynamics.action_moves))
-    answers = responsiveness.responses(paths, np.asarray(SCRIPT), yaw, moves)
-    _page(name, folder, answers, made, time.monotonic() - began).write(folder / "report.html")
+    _page(name, folder, answers(avatar, paths, SCRIPT), made, time.monotonic() - began).write(folder / "report.html")
     print(f"{name}: {len(SCRIPT)} frames in {time.monotonic() - began:.0f} s, open {folder / 'report.html'}")
     return folder
 
 
 def _page(
-    name: str, folder: Path, answers: list[dict[str, typing.Any]], made: dict[str, typing.Any], seconds: float
+    name: str, folder: Path, answered: list[dict[str, typing.Any]], made: dict[str, typing.Any], seconds: float
 ) -> Report:
     page = Report(f"UNICA: {name}, as shipped")
     page.text("Keys: 60 frames W, 60 S, 60 A, 20 idle at 30 frames a second, from standing. Four views that follow.")
@@ -51,7 +49,7 @@ def _page(
         ["key", "speed, m/s", "heading error, degrees", "turn, degrees", "frames from the key"],
         [
             (ACTIONS[r["action"]], *(r.get(k) for k in ("speed", "heading_error", "turn", "turn_frames")))
-            for r in answers
+            for r in answered
         ],
     )
     page.heading("How it was made")
