@@ -64,8 +64,8 @@ def make_step(
 
     `loss(params, key, batch)` returns the loss and more metrics; `decay` is that of the average of the weights;
     `hold(new, old, batch)` may put back parameters that must not move: a zero gradient alone does not stop Adam's
-    momentum. The metrics hold the loss and the gradient norm; a step whose gradient is not finite changes nothing and
-    counts in `skipped`.
+    momentum. In the average they are the parameters themselves. The metrics hold the loss and the gradient norm; a
+    step whose gradient is not finite changes nothing and counts in `skipped`.
     """
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
@@ -84,7 +84,10 @@ def make_step(
         if average is not None:
             # A young average follows the weights closely, so that it forgets where they started.
             rate = jnp.minimum(decay, (1.0 + state.step) / (10.0 + state.step))
-            average = keep(jax.tree.map(lambda a, p: rate * a + (1 - rate) * p, average, params), average)
+            moved = jax.tree.map(lambda a, p: rate * a + (1 - rate) * p, average, params)
+            # What is held is not averaged: it would go on moving towards the parameters.
+            moved = moved if hold is None else hold(moved, params, batch)
+            average = keep(moved, average)
         new = TrainState(params, average, opt_state, state.key, state.step + 1)
         return new, {"loss": value, "gradient_norm": norm, "skipped": 1.0 - good, **metrics}
 

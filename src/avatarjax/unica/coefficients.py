@@ -46,6 +46,11 @@ class CoefficientConfig:
     clean_contexts: float = 0.2
     rollout_frames: int = 8
     single_share: float = 0.3  # of the steps, before rollout training joins
+    context: int = CONTEXT  # frames that the network looks at, the newest of the three
+
+    def __post_init__(self):
+        if not 1 <= self.context <= CONTEXT:
+            raise ValueError(f"the model looks at 1, 2 or 3 context frames, not {self.context}")
 
     @property
     def features(self) -> int:
@@ -137,9 +142,9 @@ class CoefficientDenoiser(nnx.Module):
     """Residual MLP with adaptive layer norms, plus a linear path that starts at the ridge solution."""
 
     def __init__(self, config: CoefficientConfig, *, rngs: nnx.Rngs):
-        inputs = CONTEXT * config.features - ROOT + config.features
+        inputs = config.context * config.features - ROOT + config.features
         self.action = nnx.Linear(ACTION_FEATURES, 64, rngs=rngs)
-        self.condition1 = nnx.Linear(64 + 32 + 32 * CONTEXT, config.condition, rngs=rngs)
+        self.condition1 = nnx.Linear(64 + 32 + 32 * config.context, config.condition, rngs=rngs)
         self.condition2 = nnx.Linear(config.condition, config.condition, rngs=rngs)
         self.enter = nnx.Linear(inputs, config.width, rngs=rngs)
         self.norms = nnx.List(
@@ -158,7 +163,7 @@ class CoefficientDenoiser(nnx.Module):
     def __call__(
         self,
         context: Float[Array, "b f"],
-        noise_level: Float[Array, "b 3"],
+        noise_level: Float[Array, "b c"],
         action: Float[Array, "b 6"],
         x: Float[Array, "b d"],
         log_sigma: Float[Array, "b"],
@@ -182,16 +187,23 @@ class CoefficientDenoiser(nnx.Module):
         return self.leave(self.norms[-1](h) * (1 + scale) + shift) + self.linear(inputs)
 
 
-def context_features(scaling: Scaling, pose: Float[Array, "b 3 k"], root: Float[Array, "b 3 3"]) -> Float[Array, "b f"]:
-    """Pose, two pose differences and two root differences of contexts, all near unit size.
+def context_features(scaling: Scaling, pose: Float[Array, "b c k"], root: Float[Array, "b c 3"]) -> Float[Array, "b f"]:
+    """Newest pose, and the differences of successive poses and roots of contexts, all near unit size.
 
     `root` is relative to the newest frame, whose own entry is therefore zero and left out.
     """
     differences = 0.7 * jnp.diff(pose, axis=1) / scaling.step_scale[None, None]
     steps = jnp.diff(root, axis=1) / scaling.root_scale[None, None]
-    newest = (pose[:, 2] - scaling.pose_mean[None]) / scaling.pose_scale[None]
+    newest = (pose[:, -1] - scaling.pose_mean[None]) / scaling.pose_scale[None]
     b = pose.shape[0]
     return jnp.concatenate([newest, differences.reshape(b, -1), steps.reshape(b, -1)], axis=-1)
+
+
+def seen(config: CoefficientConfig, scaling: Scaling, context: Context) -> Float[Array, "b f"]:
+    """The features of contexts (b, 3, ...) that the network looks at, as many frames as it is configured for."""
+    newest = jnp.broadcast_to(context.root[:, 2:], context.root.shape)
+    roots = relative(context.root, newest)
+    return context_features(scaling, context.pose[:, -config.context :], roots[:, -config.context :])
 
 
 def sample(
@@ -213,10 +225,9 @@ def sample(
 def _network(config, dynamics, context: Context, noise_level, action) -> edm.Network:
     """The denoiser with everything but the noisy increment filled in."""
     module = bind(CoefficientDenoiser, config, dynamics.params)
-    newest = jnp.broadcast_to(context.root[:, 2:], context.root.shape)
-    features = context_features(dynamics.scaling, context.pose, relative(context.root, newest))
+    features = seen(config, dynamics.scaling, context)
     wish = action_features(dynamics, action, context.root[:, 2, 2])
-    return lambda x, log_sigma: module(features, noise_level, wish, x, log_sigma)
+    return lambda x, log_sigma: module(features, noise_level[:, -config.context :], wish, x, log_sigma)
 
 
 def push(context: Context, pose: Float[Array, "b k"], root: Float[Array, "b 3"]) -> Context:

@@ -68,6 +68,7 @@ class UnicaConfig:
     texel_head: TexelHeadConfig = TexelHeadConfig()  # ours
     turn_window: tuple[int, int] = (0, 25)  # frames after a key change that count as turning; code: (-5, 40)
     turn_fraction: float = 0.7  # of the second stage's samples
+    rotate: bool = False  # ours; autoencoder and UNet learn from groups turned by quarters, their keys turned too
     views_per_step: int = 8
     loss_l1: float = 0.8  # ours; 3DGS' weights, the paper gives none
     loss_ssim: float = 0.2

@@ -1,8 +1,9 @@
 """The action-conditioned multi-frame denoising UNet (UNICA 3.4, C.1).
 
-Four latent frames go in, three of them context and the fourth noisy; the noise of the fourth comes out. Every residual
+Four latent frames go in, three of them context and the last noisy; the noise of the last comes out. Every residual
 block of the stages that downsample is followed by a transformer block: attention within a frame, cross attention to the
-action embedding, and attention over the four frames at each place.
+action embedding, and attention over the four frames at each place. With fewer context frames (UNICA Fig. 8) there are
+so many fewer.
 """
 
 from __future__ import annotations
@@ -16,8 +17,6 @@ from jaxtyping import Array, Float, Int
 
 from avatarjax.nets.blocks import GROUPS, Attention, FeedForward, ResidualBlock, conv, double, sinusoidal_embedding
 
-FRAMES = 4
-
 
 @dataclasses.dataclass(frozen=True)
 class DenoiserConfig:
@@ -29,6 +28,16 @@ class DenoiserConfig:
     action_features: int = 768
     actions: int = 5
     latent_channels: int = 4
+    context: int = 3  # frames before the noisy one
+
+    def __post_init__(self):
+        if not 1 <= self.context <= 3:
+            raise ValueError(f"the model looks at 1, 2 or 3 context frames, not {self.context}")
+
+    @property
+    def frames(self) -> int:
+        """Frames that go in: the context and the noisy one."""
+        return self.context + 1
 
     @property
     def null_action(self) -> int:
@@ -41,6 +50,7 @@ class TransformerBlock(nnx.Module):
 
     def __init__(self, channels: int, config: DenoiserConfig, *, rngs: nnx.Rngs):
         heads = max(1, channels // config.head_width)
+        self.frames = config.frames
         self.enter_norm = nnx.GroupNorm(channels, num_groups=GROUPS, rngs=rngs)
         self.enter = nnx.Linear(channels, channels, rngs=rngs)
         self.spatial_norm = nnx.LayerNorm(channels, rngs=rngs)
@@ -57,15 +67,15 @@ class TransformerBlock(nnx.Module):
 
     def __call__(self, x: Float[Array, "bf h w c"], action: Float[Array, "b 1 a"]) -> Float[Array, "bf h w c"]:
         frames, h, w, c = x.shape
-        batch = frames // FRAMES
+        batch = frames // self.frames
         t = self.enter(self.enter_norm(x)).reshape(frames, h * w, c)
         t = t + self.spatial(self.spatial_norm(t))
-        t = t + self.cross(self.cross_norm(t), jnp.repeat(action, FRAMES, axis=0))
+        t = t + self.cross(self.cross_norm(t), jnp.repeat(action, self.frames, axis=0))
         t = t + self.feed(self.feed_norm(t))
-        t = t.reshape(batch, FRAMES, h * w, c).swapaxes(1, 2).reshape(batch * h * w, FRAMES, c)
+        t = t.reshape(batch, self.frames, h * w, c).swapaxes(1, 2).reshape(batch * h * w, self.frames, c)
         t = t + self.temporal(self.temporal_norm(t))
         t = t + self.temporal_feed(self.temporal_feed_norm(t))
-        t = t.reshape(batch, h * w, FRAMES, c).swapaxes(1, 2).reshape(x.shape)
+        t = t.reshape(batch, h * w, self.frames, c).swapaxes(1, 2).reshape(x.shape)
         return x + self.leave(t)
 
 
@@ -77,7 +87,7 @@ class Denoiser(nnx.Module):
         channels, first = config.channels, config.channels[0]
         embedding = 4 * first
         self.action_table = nnx.Embed(config.actions + 1, config.action_features, rngs=rngs)
-        self.frame_table = nnx.Embed(FRAMES, embedding, rngs=rngs)
+        self.frame_table = nnx.Embed(config.frames, embedding, rngs=rngs)
         self.time1 = nnx.Linear(first, embedding, rngs=rngs)
         self.time2 = nnx.Linear(embedding, embedding, rngs=rngs)
         self.enter = conv(config.latent_channels, first, rngs=rngs)
@@ -115,13 +125,13 @@ class Denoiser(nnx.Module):
         self.leave = conv(width, config.latent_channels, rngs=rngs)
 
     def __call__(
-        self, z: Float[Array, "b 4 h w l"], timestep: Int[Array, "b"], action: Int[Array, "b"]
+        self, z: Float[Array, "b f h w l"], timestep: Int[Array, "b"], action: Int[Array, "b"]
     ) -> Float[Array, "b h w l"]:
-        """The noise in the fourth frame. `action` is an id, or `config.null_action` for none."""
+        """The noise in the last of `config.frames` frames. `action` is an id, or `config.null_action` for none."""
         b, frames, h, w, latent = z.shape
         time = self.time1(sinusoidal_embedding(timestep.astype(jnp.float32), self.config.channels[0]))
         time = self.time2(jax.nn.silu(time))
-        embedding = (time[:, None] + self.frame_table(jnp.arange(FRAMES))[None]).reshape(b * frames, -1)
+        embedding = (time[:, None] + self.frame_table(jnp.arange(frames))[None]).reshape(b * frames, -1)
         action = self.action_table(action)[:, None]
 
         x = self.enter(z.reshape(b * frames, h, w, latent))

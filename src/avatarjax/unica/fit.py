@@ -78,10 +78,7 @@ def ridge_start(
     """The network's parameters with its linear path set to the ridge regression of the increment on the context."""
     scaling = dynamics.scaling
     disturbance = noise * scaling.step_scale[None, None] * jax.random.normal(key, context.pose.shape)
-    newest = jnp.broadcast_to(context.root[:, 2:], context.root.shape)
-    features = coefficients.context_features(
-        scaling, context.pose + disturbance, coefficients.relative(context.root, newest)
-    )
+    features = coefficients.seen(config, scaling, context.replace(pose=context.pose + disturbance))
     increment = jnp.concatenate(
         [
             (target_pose - (context.pose + disturbance)[:, 2]) / scaling.step_scale[None],

@@ -17,7 +17,7 @@ from avatarjax.posmap import Atlas
 from avatarjax.unica.denoiser import Denoiser, DenoiserConfig
 from avatarjax.unica.vae import VAE, VAEConfig, kl_divergence, sample_latent
 
-CONTEXT = 3
+CONTEXT = 3  # frames of a state; a network may look at fewer of them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +33,8 @@ class LatentConfig:
     guidance: float = 1.0  # code
     action_dropout: float = 0.1  # ours; usual for guidance
     context_noise: float = 0.1  # ours; the largest standard deviation, in units of the latents'
+    clean_contexts: float = 0.3  # code; share of the samples whose context has no noise
+    noise_offset: float = 0.0  # ours; noise of this size that all places of a channel share, in training
     from_last: bool = False  # ours; the network's output is the change from frame t, from which the noise follows
     min_snr: float = (
         0.0  # ours; weight the loss by min(SNR, this) / SNR (Hang et al. 2023); 0 is the paper's plain loss
@@ -110,16 +112,16 @@ def diffusion_loss(
     action: Int[Array, "b"],
 ) -> Float[Array, ""]:
     """Epsilon loss on the fourth frame, with context noise and action dropout (UNICA Eq. 5 and 3.6)."""
-    time_key, noise_key, drop_key, level_key, context_key = jax.random.split(key, 5)
+    time_key, noise_key, drop_key, context_key = jax.random.split(key, 4)
+    groups = groups[:, -config.denoiser.frames :]
     b, frames, t, _ = groups.shape
     latents = encode(config, atlas, dynamics, groups.reshape(b * frames, t, 3))
     latents = jax.lax.stop_gradient(latents).reshape(b, frames, *latents.shape[1:])
-    context, target = latents[:, :CONTEXT], latents[:, CONTEXT]
+    context, target = latents[:, :-1], latents[:, -1]
 
-    level = config.context_noise * jax.random.uniform(level_key, (b, CONTEXT, 1, 1, 1))
-    context = context + level * jax.random.normal(context_key, context.shape)
+    context = context + _context_noise(config, context_key, context.shape)
     timestep = jax.random.randint(time_key, (b,), 0, config.train_timesteps)
-    noise = jax.random.normal(noise_key, target.shape)
+    noise = _noise(config, noise_key, target.shape)
     signal = schedules.alphas_cumprod(config.schedule, config.train_timesteps)
     noisy = schedules.add_noise(signal, target, noise, timestep)
     dropped = jax.random.uniform(drop_key, (b,)) < config.action_dropout
@@ -132,10 +134,27 @@ def diffusion_loss(
     return jnp.mean(weight * jnp.mean((predicted - noise) ** 2, axis=(1, 2, 3)))
 
 
+def _context_noise(config: LatentConfig, key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "b c u v l"]:
+    """Noise of an own level for each frame of each context, and none for a share of the contexts (UNICA 3.6)."""
+    level_key, clean_key, noise_key = jax.random.split(key, 3)
+    level = config.context_noise * jax.random.uniform(level_key, (*shape[:2], 1, 1, 1))
+    clean = jax.random.uniform(clean_key, (shape[0], 1, 1, 1, 1)) < config.clean_contexts
+    return jnp.where(clean, 0.0, level) * jax.random.normal(noise_key, shape)
+
+
+def _noise(config: LatentConfig, key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "b u v l"]:
+    """Unit noise, with the offset of each channel where the configuration asks for one."""
+    noise = jax.random.normal(key, shape)
+    if config.noise_offset == 0:
+        return noise
+    offset = jax.random.normal(jax.random.fold_in(key, 1), (shape[0], 1, 1, shape[-1]))
+    return noise + config.noise_offset * offset
+
+
 def _predict_noise(
     config: LatentConfig,
     dynamics: LatentDynamics,
-    context: Float[Array, "b 3 u v l"],
+    context: Float[Array, "b c u v l"],
     noisy: Float[Array, "b u v l"],
     timestep: Int[Array, "b"],
     action: Int[Array, "b"],
@@ -159,6 +178,7 @@ def sample(
     action: Int[Array, "b"],
 ) -> Float[Array, "b t 3"]:
     """The next frame's normalised texels from three normalised frames, by DDIM (UNICA 3.7)."""
+    context = context[:, -config.denoiser.context :]
     b, frames, t, _ = context.shape
     latents = encode(config, atlas, dynamics, context.reshape(b * frames, t, 3))
     latents = latents.reshape(b, frames, *latents.shape[1:])

@@ -25,8 +25,9 @@ from avatarjax.nets.functional import Params
 from avatarjax.posmap import pca as pcs
 from avatarjax.train import TrainState, fit, make_step, new_state, weights
 from avatarjax.train.state import Loss, optimiser
-from avatarjax.unica import batches, coefficients, latent
+from avatarjax.unica import batches, coefficients, latent, quarters
 from avatarjax.unica import fit as closed_form
+from avatarjax.unica.batches import Windows
 from avatarjax.unica.coefficients import CoefficientDenoiser, CoefficientDynamics, Context
 from avatarjax.unica.config import StageConfig, UnicaConfig
 from avatarjax.unica.denoiser import Denoiser
@@ -80,11 +81,33 @@ def new_latent_dynamics(config: UnicaConfig, data: Dataset, run: Run) -> LatentD
     )
 
 
+MakeGroups = Callable[[np.ndarray, np.random.Generator], tuple[np.ndarray, np.ndarray]]
+
+
+def _training_groups(config: UnicaConfig, data: Dataset) -> tuple[Windows, MakeGroups]:
+    """The windows that autoencoder and UNet learn from, and the function that makes normalised groups (b, 4, t, 3) and
+    their actions (b,) of chosen ones: as recorded or, where `rotate` is set, each turned by quarters at random."""
+    windows = batches.windows(data.train, 4, config.turn_window)
+    scale = float(data.atlas.scale)
+    if not config.rotate:
+        return windows, lambda chosen, rng: windows.groups(chosen, scale)
+    ground = data.train.roots[:, [0, 2, 1]]
+    asked = closed_form.action_directions(ground, data.train.actions, data.train.sequence, config.actions)
+    table = quarters.permutations(*asked)
+
+    def turned(chosen, rng):
+        groups, actions = windows.groups(chosen, scale)
+        turns = rng.integers(0, 4, len(chosen))
+        return quarters.turn(groups, turns), table[turns, actions]
+
+    return windows, turned
+
+
 def _sample_groups(config: UnicaConfig, data: Dataset, count: int) -> np.ndarray:
     """Evenly spaced training groups (count, 4, t, 3) in normalised space."""
-    windows = batches.windows(data.train, 4, config.turn_window)
+    windows, make = _training_groups(config, data)
     chosen = np.linspace(0, len(windows.first) - 1, min(count, len(windows.first))).astype(int)
-    return windows.groups(chosen, float(data.atlas.scale))[0]
+    return make(chosen, np.random.default_rng(0))[0]
 
 
 def train_vae(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamics) -> LatentDynamics:
@@ -92,13 +115,12 @@ def train_vae(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamic
 
     Returns the dynamics with the trained autoencoder and the statistics of its latents.
     """
-    windows = batches.windows(data.train, 4, config.turn_window)
-    scale = float(data.atlas.scale)
-    stage = config.vae_stage
+    windows, make = _training_groups(config, data)
+    stage, settings = config.vae_stage, (config.latent, config.rotate)
 
     def batch_at(step):
         rng = batches.generator(run.seed, step)
-        groups, _ = windows.groups(rng.integers(0, len(windows.first), stage.batch), scale)
+        groups, _ = make(rng.integers(0, len(windows.first), stage.batch), rng)
         texels = groups[np.arange(stage.batch), rng.integers(0, 4, stage.batch)]
         return {"atlas": data.atlas, "frozen": start.replace(vae={}, denoiser={}), "texels": texels}
 
@@ -106,7 +128,7 @@ def train_vae(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamic
         dynamics = batch["frozen"].replace(vae=params)
         return latent.vae_loss(config.latent, batch["atlas"], dynamics, key, batch["texels"])
 
-    trained = start.replace(vae=train_stage(run, "vae", stage, config.latent, loss, start.vae, batch_at))
+    trained = start.replace(vae=train_stage(run, "vae", stage, settings, loss, start.vae, batch_at))
     groups = _sample_groups(config, data, 64)
     encode = jax.jit(functools.partial(latent.encode, config.latent))
     mean, spread = closed_form.latent_statistics(encode(data.atlas, trained, groups.reshape(-1, *groups.shape[2:])))
@@ -119,17 +141,17 @@ def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynami
     The first stage learns action embeddings and UNet on steady movement only. The second freezes the embeddings and
     draws 70 % of its groups from the frames after a turning point.
     """
-    windows = batches.windows(data.train, 4, config.turn_window)
-    scale = float(data.atlas.scale)
+    windows, make = _training_groups(config, data)
     stage = config.unet_stage
     everything = np.ones_like(windows.turning)
-    settings = (config.latent, config.vae_stage, config.unet_steady, config.turn_window, config.turn_fraction)
+    turns = (config.turn_window, config.turn_fraction, config.rotate)
+    settings = (config.latent, config.vae_stage, config.unet_steady, *turns)
 
     def batch_at(step):
         rng = batches.generator(run.seed, step)
         steady = step < config.unet_steady * stage.steps
         allowed, fraction = (~windows.turning, 0.0) if steady else (everything, config.turn_fraction)
-        groups, actions = windows.groups(batches.draw(allowed, windows.turning, fraction, stage.batch, rng), scale)
+        groups, actions = make(batches.draw(allowed, windows.turning, fraction, stage.batch, rng), rng)
         return {
             "atlas": data.atlas,
             "frozen": start.replace(denoiser={}),

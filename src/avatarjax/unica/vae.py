@@ -25,11 +25,17 @@ class VAEConfig:
     latent_channels: int = 4
     data_channels: int = 3
     positions: int = 0
+    decoder_blocks: int | None = None  # a stage of the decoder; None: as many as `residual_blocks`; code: 3
 
     @property
     def downsampling(self) -> int:
         """Map side divided by latent side."""
         return 2 ** (len(self.channels) - 1)
+
+    @property
+    def blocks_up(self) -> int:
+        """Residual blocks a stage of the decoder."""
+        return self.residual_blocks if self.decoder_blocks is None else self.decoder_blocks
 
 
 class Middle(nnx.Module):
@@ -88,7 +94,7 @@ class VAE(nnx.Module):
         self.decoder_middle = Middle(last, rngs=rngs)
         self.up, self.grow = nnx.List(), nnx.List()
         for stage, channels in enumerate(reversed(config.channels)):
-            for _ in range(config.residual_blocks):
+            for _ in range(config.blocks_up):
                 self.up.append(ResidualBlock(width, channels, rngs=rngs))
                 width = channels
             if stage < len(config.channels) - 1:
@@ -113,8 +119,8 @@ class VAE(nnx.Module):
         """Maps in [-1, 1] (not clipped) of latents."""
         x = self.decoder_middle(self._place("decoder_coarse", self.from_latent(z)))
         for stage in range(len(self.config.channels)):
-            for k in range(self.config.residual_blocks):
-                x = self.up[stage * self.config.residual_blocks + k](x)
+            for k in range(self.config.blocks_up):
+                x = self.up[stage * self.config.blocks_up + k](x)
             if stage < len(self.grow):
                 x = self.grow[stage](double(x))
         return self.leave(jax.nn.silu(self.decoder_norm(self._place("decoder_fine", x))))
