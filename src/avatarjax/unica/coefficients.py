@@ -24,6 +24,8 @@ from avatarjax.nets.blocks import sinusoidal_embedding
 from avatarjax.nets.functional import Params, bind
 from avatarjax.posmap import Atlas
 from avatarjax.posmap import pca as pcs
+from avatarjax.unica import stance
+from avatarjax.unica.stance import Stance
 
 CONTEXT = 3
 ROOT = 3
@@ -79,7 +81,7 @@ class CoefficientDynamics:
     """A trained model: network parameters, the basis of canonical poses, scaling, and what each action asks for.
 
     action_yaw (a,) is the world heading in radians that an action drives towards, action_moves (a,) 1 for an action
-    that moves and 0 for one that stands.
+    that moves and 0 for one that stands. `stance` holds feet where they stand; None while training and without feet.
     """
 
     params: Params
@@ -87,6 +89,7 @@ class CoefficientDynamics:
     scaling: Scaling
     action_yaw: Float[Array, "a"]
     action_moves: Float[Array, "a"]
+    stance: Stance | None = None
 
 
 @typing.no_type_check
@@ -219,7 +222,10 @@ def sample(
     increment = edm.euler(network, noise, edm.sigma_steps(config.sample_steps, config.sigma_min, config.sigma_max))
     pose_step = increment[:, : config.components] * dynamics.scaling.step_scale[None]
     root_step = increment[:, config.components :] * dynamics.scaling.root_scale[None]
-    return context.pose[:, -1] + pose_step, compose(context.root[:, -1], root_step)
+    pose = context.pose[:, -1] + pose_step
+    if dynamics.stance is not None:
+        pose, root_step = stance.hold(dynamics.stance, dynamics.basis, context.pose[:, -1], pose, root_step)
+    return pose, compose(context.root[:, -1], root_step)
 
 
 def _network(config, dynamics, context: Context, noise_level, action) -> edm.Network:

@@ -19,6 +19,7 @@ from avatarjax.unica.avatar import Avatar
 from avatarjax.unica.coefficients import CoefficientDynamics, Scaling
 from avatarjax.unica.config import PRESETS, DynamicsName, UnicaConfig
 from avatarjax.unica.latent import LatentDynamics
+from avatarjax.unica.stance import Stance
 
 VERSION = 2
 SHIPPED = Path(__file__).parent.parent / "assets" / "avatars"
@@ -95,8 +96,9 @@ def _read(path: Path) -> Avatar:
         if "vae" in dynamics:
             dynamics = LatentDynamics(**dynamics)
         else:
-            dynamics = dynamics | {"basis": PCA(**dynamics["basis"]), "scaling": Scaling(**dynamics["scaling"])}
-            dynamics = CoefficientDynamics(**dynamics)
+            parts: dict[str, typing.Any] = {"basis": PCA, "scaling": Scaling, "stance": Stance}
+            made = {name: cls(**dynamics[name]) for name, cls in parts.items() if name in dynamics}
+            dynamics = CoefficientDynamics(**(dynamics | made))
         atlas = Atlas(**tree["atlas"], size=config.size)
         return Avatar(
             atlas=atlas,

@@ -1,7 +1,7 @@
 """What is computed from the data in closed form before and between the trained stages.
 
 Statistics of the latents, the alignment basis, and for the coefficient model: the pose basis, the scaling, what each
-action asks for, and the ridge solution at which its linear path starts.
+action asks for, the ridge solution at which its linear path starts, and what holds its feet where they stand.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from avatarjax.data.sequences import Recording
 from avatarjax.nets.functional import Params
 from avatarjax.posmap import pca as pcs
-from avatarjax.unica import coefficients
+from avatarjax.unica import coefficients, stance
 from avatarjax.unica.coefficients import CoefficientConfig, CoefficientDynamics, Context, Scaling
+from avatarjax.unica.stance import Stance
 
 
 def action_directions(
@@ -93,6 +95,35 @@ def ridge_start(
     kernel[: features.shape[1]] = solution[:-1]
     linear = {"kernel": jnp.asarray(kernel), "bias": jnp.asarray(solution[-1], jnp.float32)}
     return {**dynamics.params, "linear": linear}
+
+
+def fit_stance(
+    config: CoefficientConfig,
+    dynamics: CoefficientDynamics,
+    recording: Recording,
+    standing: Float[Array | np.ndarray, "t 3"],
+    context: Context,
+    target_pose: Float[Array, "b k"],
+    target_root: Float[Array, "b 3"],
+    action: Int[Array | np.ndarray, "b"],
+    key: Key[Array, ""],
+) -> Stance | None:
+    """What a trained model needs for `stance.hold`: soles, and the covariance of its one-step errors.
+
+    Errors are those on the given contexts, of training data. None where no soles are found.
+    """
+    found = stance.find_soles(
+        *(np.asarray(x) for x in (recording.texels, recording.roots, recording.sequence, standing))
+    )
+    if found is None:
+        return None
+    pose, root = jax.jit(coefficients.sample, static_argnums=0)(config, dynamics, key, context, jnp.asarray(action))
+    newest = context.root[:, 2]
+    missed = coefficients.relative(root, newest) - coefficients.relative(target_root, newest)
+    errors = np.asarray(jnp.concatenate([pose - target_pose, missed], axis=-1), np.float64)
+    spread = stance.square_root(errors.T @ errors / len(errors))
+    soles, slack = found
+    return Stance(jnp.asarray(soles), jnp.asarray(spread, jnp.float32), jnp.asarray(slack, jnp.float32))
 
 
 def latent_statistics(latents: Float[Array, "n u v l"]) -> tuple[Float[Array, "l"], Float[Array, "l"]]:

@@ -206,14 +206,9 @@ def train_coefficients(config: UnicaConfig, data: Dataset, run: Run) -> Coeffici
     long_turning = near_turn[long.first + 3 + settings.rollout_frames // 2]
 
     everything = single.frames(np.arange(len(single.first)))
-    linear = closed_form.ridge_start(
-        settings,
-        start,
-        Context(jnp.asarray(poses[everything[:, :3]]), jnp.asarray(roots[everything[:, :3]])),
-        jnp.asarray(poses[everything[:, 3]]),
-        jnp.asarray(roots[everything[:, 3]]),
-        run.key("ridge"),
-    )
+    known = Context(jnp.asarray(poses[everything[:, :3]]), jnp.asarray(roots[everything[:, :3]]))
+    wanted = jnp.asarray(poses[everything[:, 3]]), jnp.asarray(roots[everything[:, 3]])
+    linear = closed_form.ridge_start(settings, start, known, *wanted, run.key("ridge"))
 
     def windows_at(windows, turning, count, rng):
         chosen = batches.draw(np.ones_like(turning), turning, config.turn_fraction, count, rng)
@@ -264,8 +259,12 @@ def train_coefficients(config: UnicaConfig, data: Dataset, run: Run) -> Coeffici
         roll_loss = jax.lax.cond(batch["rolling"], rolled, lambda _: single_loss, None)
         return 0.5 * (single_loss + roll_loss), {"single": single_loss, "rollout": roll_loss}
 
-    params = train_stage(run, "coefficients", stage, settings, loss, linear, batch_at)
-    return start.replace(params=params)
+    trained = start.replace(params=train_stage(run, "coefficients", stage, settings, loss, linear, batch_at))
+    actions = data.train.actions[everything[:, 2]]
+    held = closed_form.fit_stance(
+        settings, trained, data.train, data.standing, known, *wanted, actions, run.key("stance")
+    )
+    return trained.replace(stance=held)
 
 
 def fit_alignment(config: UnicaConfig, data: Dataset, run: Run) -> pcs.PCA:
