@@ -57,28 +57,32 @@ def hold(
     count = before.shape[1]
     axes = basis.basis.reshape(count, -1, 3)[:, stance.soles]
     mean = basis.mean.reshape(-1, 3)[stance.soles]
+    middles = axes.mean(2)
 
-    def feet(pose, step):
-        """Ground positions (4,) of both soles' middles, and the heights (2,) of their lowest points."""
+    def feet(pose):
+        """The middle (2, 3) of either sole, and the height (2,) of its lowest point."""
         points = jnp.tensordot(pose, axes, 1) + mean
-        x, y, z = points[..., 0], points[..., 1], points[..., 2]
-        c, s = jnp.cos(step[2]), jnp.sin(step[2])
-        ground = jnp.stack([(c * x + s * z).mean(1) + step[0], (c * z - s * x).mean(1) + step[1]], axis=-1)
-        return ground.reshape(4), y.min(1)
+        return points.mean(1), points[..., 1].min(1)
+
+    def turned(yaw, points):
+        """Ground positions (..., 2) of points (..., 3) after a turn."""
+        c, s = jnp.cos(yaw), jnp.sin(yaw)
+        return jnp.stack([c * points[..., 0] + s * points[..., 2], c * points[..., 2] - s * points[..., 0]], axis=-1)
 
     def correct(before, after, step):
-        stood, low = feet(before, jnp.zeros(ROOT))
-        stands, still_low = feet(after, step)
-        slid = stands - stood
-        resting = (low < HEIGHT) & (still_low < HEIGHT) & (jnp.sum(slid.reshape(2, 2) ** 2, axis=1) < SWING**2)
+        (stood, low), (stands, still_low) = feet(before), feet(after)
+        there = turned(step[2], stands)
+        slid = there + step[None, :2] - turned(0.0, stood)
+        resting = (low < HEIGHT) & (still_low < HEIGHT) & (jnp.sum(slid**2, axis=1) < SWING**2)
         seen = jnp.repeat(resting.astype(slid.dtype), 2)
-        slope = jax.jacfwd(lambda change: feet(after + change[:count], step + change[count:])[0])(
-            jnp.zeros(count + ROOT)
-        )
-        factor = (seen[:, None] * slope) @ stance.spread
+        # How the ground positions change with the pose, with the root's place and with its heading.
+        by_pose = turned(step[2], middles).reshape(count, 4)
+        by_heading = jnp.stack([there[:, 1], -there[:, 0]], axis=-1).reshape(1, 4)
+        slope = jnp.concatenate([by_pose, jnp.tile(jnp.eye(2), (1, 2)), by_heading])
+        factor = (seen[:, None] * slope.T) @ stance.spread
         # What is not seen has no say; the floor of a hundredth of a millimetre keeps a slack of zero solvable.
         innovation = factor @ factor.T + jnp.diag(jnp.where(seen > 0, stance.slack**2 + 1e-10, 1.0))
-        change = -stance.spread @ (factor.T @ jnp.linalg.solve(innovation, seen * slid))
+        change = -stance.spread @ (factor.T @ jnp.linalg.solve(innovation, seen * slid.reshape(4)))
         return after + change[:count], step + change[count:]
 
     return jax.vmap(correct)(before, after, step)
