@@ -52,18 +52,17 @@ def long_script(frames: int, actions: int, seed: int) -> np.ndarray:
     return np.repeat(keys[1:], HOLD)[:frames].astype(np.int32)
 
 
-def roll_long(avatar: unica.Avatar, data: Dataset, seed: int) -> Long:
-    """Roll LONG frames out under changing keys, without appearance."""
-    actions = long_script(LONG, avatar.config.actions, seed)
+def roll_long(avatar: unica.Avatar, data: Dataset, seed: int, frames: int = LONG) -> Long:
+    """Roll so many frames out under changing keys, without appearance."""
+    actions = long_script(frames, avatar.config.actions, seed)
     state = unica.reset(avatar, jax.random.key(seed))
-    frames = jax.jit(unica.rollout, static_argnames="gaussians")(avatar, state, jnp.asarray(actions), gaussians=False)[
-        1
-    ]
-    texels, roots = (np.asarray(x) for x in (forecast.surfaces(avatar.atlas, frames), frames.root))
+    roll = jax.jit(unica.rollout, static_argnames="gaussians")
+    rolled = roll(avatar, state, jnp.asarray(actions), gaussians=False)[1]
+    texels, roots = (np.asarray(x) for x in (forecast.surfaces(avatar.atlas, rolled), rolled.root))
     good = np.isfinite(texels).all((1, 2)) & np.isfinite(roots).all(1) & (np.abs(texels).max((1, 2)) < LOST)
     count = len(good) if good.all() else int(np.argmin(good))
     distance = drift.nearest_distance(texels[:count], np.asarray(data.train.texels)) if count else np.zeros(0)
-    return Long(actions[:count], texels[:count], roots[:count], distance, np.asarray(frames.info.ground)[:count])
+    return Long(actions[:count], texels[:count], roots[:count], distance, np.asarray(rolled.info.ground)[:count])
 
 
 def trends(rolled: Long) -> dict[str, drift.Trend]:

@@ -108,6 +108,24 @@ def test_held_parameters_do_not_move(key):
     np.testing.assert_allclose(state.params["w"], [0.2, 0, 0.6], rtol=1e-6)
 
 
+def test_in_the_average_held_parameters_are_the_parameters_themselves(key):
+    """From the moment they are held: an average would go on moving towards them."""
+
+    def hold(new, old, batch):
+        return {"w": jnp.where(batch[0] > 0, new["w"], old["w"])}
+
+    step = make_step(quadratic, optax.adam(0.1), decay=0.9, hold=hold)
+    state = fresh(key, optax.adam(0.1), averaged=True)
+    for _ in range(3):
+        state, _ = step(state, TARGET)
+    learned = np.array(state.params["w"])
+    assert np.abs(state.average["w"] - learned).max() > 1e-3
+    for _ in range(2):
+        state, _ = step(state, -TARGET)
+        np.testing.assert_array_equal(state.params["w"], learned)
+        np.testing.assert_array_equal(state.average["w"], learned)
+
+
 def test_every_step_has_its_own_randomness(key):
     step = make_step(lambda p, k, b: (jnp.sum(p["w"]) + jax.random.normal(k), {}), SGD)
     state, losses = fresh(key), []

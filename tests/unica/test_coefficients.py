@@ -89,6 +89,20 @@ def test_turning_the_world_turns_what_is_sampled(config, coefficient_dynamics, c
     np.testing.assert_allclose(root_turned, turned(root), atol=1e-3)
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_with_fewer_context_frames_older_ones_do_not_matter(config, coefficient_dynamics, contexts, key, count):
+    settings = dataclasses.replace(config.coefficients, context=count)
+    dynamics = coefficient_dynamics.replace(params=random_params(co.CoefficientDenoiser, settings, scale=0.1))
+    action = jnp.array([0, 1, 2, 3, 4])
+    before = sample(settings, dynamics, key, contexts, action)[0]
+
+    def moved(frame):
+        other = contexts.replace(pose=contexts.pose.at[:, frame].add(0.1))
+        return np.abs(sample(settings, dynamics, key, other, action)[0] - before).max()
+
+    assert [moved(frame) > 1e-5 for frame in range(3)] == [frame >= 3 - count for frame in range(3)]
+
+
 def test_another_key_draws_another_sample(config, coefficient_dynamics, contexts, key):
     action = jnp.array([0, 1, 2, 3, 4])
     one, _ = sample(config.coefficients, coefficient_dynamics, key, contexts, action)

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -77,3 +79,22 @@ def test_samples_of_a_batch_do_not_mix(params, z):
     action = jnp.array([1, 2])
     other = predict(params, z.at[1].set(0.0), TIME, action)
     np.testing.assert_allclose(other[0], predict(params, z, TIME, action)[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("context", [1, 2])
+def test_with_fewer_context_frames_it_takes_so_many_and_one(context, z):
+    config = dataclasses.replace(CONFIG, context=context)
+    params = random_params(Denoiser, config)
+    assert params["frame_table"]["embedding"].shape[0] == context + 1
+    run = jax.jit(lambda z: functional.bind(Denoiser, config, params)(z, TIME, jnp.array([1, 2])))
+    few = z[:, : context + 1]
+    before = run(few)
+    assert before.shape == (2, 4, 4, 4)
+    for frame in range(context + 1):
+        assert np.abs(run(few.at[:, frame].add(1.0)) - before).max() > 1e-4
+
+
+@pytest.mark.parametrize("context", [0, 4])
+def test_another_number_of_context_frames_is_refused(context):
+    with pytest.raises(ValueError, match=f"1, 2 or 3 context frames, not {context}"):
+        dataclasses.replace(CONFIG, context=context)

@@ -118,6 +118,21 @@ class TestLoss:
         loss = self.loss(monkeypatch, settings, tiny_data, latent_dynamics, groups, spread)
         assert float(loss) == pytest.approx(1, abs=0.5)
 
+    def test_with_fewer_context_frames_the_newest_are_seen(
+        self, monkeypatch, settings, tiny_data, latent_dynamics, groups
+    ):
+        """One context frame: the network gets frame t and the noisy one, and the target is the same."""
+        target, last = (encode(settings, tiny_data.atlas, latent_dynamics, groups[:, k]) for k in (3, 2))
+        one = dataclasses.replace(settings.denoiser, context=1)
+        settings = dataclasses.replace(settings, from_last=True, denoiser=one)
+
+        def knows(z, timestep, action):
+            assert z.shape[1] == 2
+            return target - last + 1e3 * (z[:, 0] - last)
+
+        loss = self.loss(monkeypatch, settings, tiny_data, latent_dynamics, groups, knows)
+        assert float(loss) == pytest.approx(0, abs=1e-3)
+
     @pytest.mark.parametrize("share", [0.0, 1.0])
     def test_actions_are_dropped_to_the_null_action(
         self, monkeypatch, settings, tiny_data, latent_dynamics, groups, share
@@ -155,6 +170,53 @@ def test_sampling_decodes_the_point_that_the_noise_leads_to(
         )
     )(groups[:1, :3])
     np.testing.assert_allclose(got, expected, atol=1e-4)
+
+
+def test_contexts_have_noise_of_their_own_and_a_share_has_none(config):
+    settings = dataclasses.replace(config.latent, context_noise=0.5, clean_contexts=0.3)
+    noise = np.asarray(latent._context_noise(settings, jax.random.key(0), (4000, 3, 4, 4, 2)))
+    size = noise.std((2, 3, 4))
+    clean = (size == 0).all(1)
+    assert clean.mean() == pytest.approx(0.3, abs=0.03)
+    assert not (size[~clean] == 0).any()
+    assert size.max() < 0.5 * 1.6 and size[~clean].mean() == pytest.approx(0.25, abs=0.02)
+    assert np.abs(np.corrcoef(size[~clean].T) - np.eye(3)).max() < 0.06  # a level for each frame
+
+
+def test_offset_noise_is_shared_by_the_places_of_a_channel(config):
+    def noise(offset):
+        settings = dataclasses.replace(config.latent, noise_offset=offset)
+        return np.asarray(latent._noise(settings, jax.random.key(0), (500, 8, 8, 4)))
+
+    plain, moved = noise(0.0), noise(0.5)
+    assert plain.std() == pytest.approx(1, abs=0.01)
+    np.testing.assert_allclose(np.ptp(moved - plain, axis=(1, 2)), 0, atol=1e-5)
+    assert (moved - plain)[:, 0, 0].std() == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize("scale, actions", [(1.0, [1]), (2.0, [5, 1])])
+def test_guidance_asks_the_network_without_action_only_where_it_is_on(
+    monkeypatch, config, tiny_data, latent_dynamics, groups, scale, actions
+):
+    """The calls of one traced sampling step, by the action that they are given."""
+    settings = dataclasses.replace(config.latent, guidance=scale, from_last=False, sample_steps=1)
+    asked = []
+
+    def network(z, timestep, action):
+        asked.append(action)
+        return z[:, 3] * (1.0 + action[:, None, None, None])
+
+    bind = latent.bind
+    monkeypatch.setattr(latent, "bind", lambda cls, c, p: network if cls is latent.Denoiser else bind(cls, c, p))
+    monkeypatch.setattr(latent.samplers.jax.lax, "scan", lambda step, x, inputs: step(x, [i[0] for i in inputs]))
+    sampled = []
+    monkeypatch.setattr(latent, "decode", lambda c, a, d, z: sampled.append(z) or groups[:1, 3])
+    latent.sample(settings, tiny_data.atlas, latent_dynamics, jax.random.key(0), groups[:1, :3], jnp.array([1]))
+    assert [int(a[0]) for a in asked] == actions
+    start = jax.random.normal(jax.random.key(0), sampled[0].shape)
+    signal = schedules.alphas_cumprod(settings.schedule, settings.train_timesteps)[-1]
+    noise = start * (2.0 if scale == 1.0 else 6.0 + 2.0 * (2.0 - 6.0))
+    np.testing.assert_allclose(sampled[0], (start - jnp.sqrt(1 - signal) * noise) / jnp.sqrt(signal), rtol=1e-4)
 
 
 def test_the_autoencoders_loss_is_its_foreground_error(config, tiny_data, latent_dynamics, groups):

@@ -1,5 +1,7 @@
 """The contract of an avatar that answers keys: pure, and the same by steps, by scan, in batches and when jitted."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,10 @@ import pytest
 
 from avatarjax import posmap, unica
 from avatarjax.posmap import pca
+from avatarjax.unica.coefficients import CoefficientDenoiser
+from avatarjax.unica.denoiser import Denoiser
 from avatarjax.unica.latent import LatentDynamics
+from tests.parameters import random_params
 
 ACTIONS = np.array([1, 1, 3, 0], np.int32)
 roll = jax.jit(unica.rollout)
@@ -154,3 +159,29 @@ def test_info_tells_how_far_alignment_moves_and_the_lowest_texel(avatar, start, 
     assert (info.pca_residual[0] > 1e-3) == (avatar.pca is not None)
     lowest = (float(texels[:, 1].min()) - 0.5) / scale + float(start.offset[1])
     assert float(info.ground[0]) == pytest.approx(lowest, abs=1e-4)
+
+
+def looking_at_two(avatar):
+    """The avatar with a model of two context frames."""
+    config = avatar.config
+    if isinstance(avatar.dynamics, LatentDynamics):
+        denoiser = dataclasses.replace(config.latent.denoiser, context=2)
+        dynamics = avatar.dynamics.replace(denoiser=random_params(Denoiser, denoiser))
+        config = dataclasses.replace(config, latent=dataclasses.replace(config.latent, denoiser=denoiser))
+    else:
+        settings = dataclasses.replace(config.coefficients, context=2)
+        dynamics = avatar.dynamics.replace(params=random_params(CoefficientDenoiser, settings, scale=0.1))
+        config = dataclasses.replace(config, coefficients=settings)
+    return avatar.replace(dynamics=dynamics, config=config)
+
+
+def test_a_model_of_two_context_frames_rolls_out_from_the_same_state(avatar, start):
+    """The state still has three, so that whatever keeps or makes one need not know."""
+    few = looking_at_two(avatar)
+    last, frames = jax.jit(lambda s: unica.rollout(few, s, jnp.asarray(ACTIONS), gaussians=False))(start)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(frames))
+    assert [x.shape for x in jax.tree.leaves(last.context)] == [x.shape for x in jax.tree.leaves(start.context)]
+    oldest = jax.tree.map(lambda x: x.at[0].add(0.05), start.context)
+    again = jax.jit(lambda s: unica.step(few, s, 1)[0].context)(start.replace(context=oldest))
+    once = jax.jit(lambda s: unica.step(few, s, 1)[0].context)(start)
+    assert_same(jax.tree.map(lambda x: x[-1], again), jax.tree.map(lambda x: x[-1], once), 1e-5)

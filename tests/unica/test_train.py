@@ -35,8 +35,8 @@ def losses(run, name):
 
 
 class TestUnet:
-    @pytest.fixture
-    def stage(self, few, tiny_data, run, latent_dynamics, monkeypatch):
+    @staticmethod
+    def handed_over(config, tiny_data, run, latent_dynamics, monkeypatch):
         """What the training of the UNet hands to the loop: batches by step, and what holds parameters."""
         handed = {}
 
@@ -45,8 +45,12 @@ class TestUnet:
             return initial
 
         monkeypatch.setattr(train, "train_stage", loop)
-        train.train_unet(few, tiny_data, run, latent_dynamics)
+        train.train_unet(config, tiny_data, run, latent_dynamics)
         return handed
+
+    @pytest.fixture
+    def stage(self, few, tiny_data, run, latent_dynamics, monkeypatch):
+        return self.handed_over(few, tiny_data, run, latent_dynamics, monkeypatch)
 
     def test_the_first_stage_comes_first_and_learns_the_embeddings(self, stage):
         assert [bool(stage["batch_at"](k)["learn_actions"]) for k in range(6)] == [True] * 3 + [False] * 3
@@ -66,6 +70,35 @@ class TestUnet:
         known = {g.tobytes() for g in groups}
         turning = [np.mean([g.tobytes() in known for g in stage["batch_at"](k)["groups"]]) for k in range(6)]
         assert max(turning[:3]) == 0 and max(turning[3:]) > 0
+
+    @pytest.mark.parametrize("window", [(0, 25), (-5, 40)])
+    def test_the_turning_window_reaches_both_stages(self, few, tiny_data, run, latent_dynamics, monkeypatch, window):
+        config = dataclasses.replace(few, turn_window=window, turn_fraction=1.0)
+        batch_at = self.handed_over(config, tiny_data, run, latent_dynamics, monkeypatch)["batch_at"]
+        windows = batches.windows(tiny_data.train, 4, window)
+        groups, _ = windows.groups(np.flatnonzero(windows.turning), float(tiny_data.atlas.scale))
+        known = {g.tobytes() for g in groups}
+        turning = [{g.tobytes() in known for g in batch_at(k)["groups"]} for k in range(6)]
+        assert turning == [{False}] * 3 + [{True}] * 3
+
+    def test_turned_groups_come_with_turned_keys(self, few, tiny_data, run, latent_dynamics, monkeypatch):
+        """The root moves where the key of a turned steady group asks, and every key meets every turn."""
+        config = dataclasses.replace(few, rotate=True, unet_stage=StageConfig(6, 200, 1e-2))
+        batch = self.handed_over(config, tiny_data, run, latent_dynamics, monkeypatch)["batch_at"](0)
+        plain = self.handed_over(
+            dataclasses.replace(config, rotate=False), tiny_data, run, latent_dynamics, monkeypatch
+        )
+        before = plain["batch_at"](0)
+        root = np.einsum("t,bftc->bfc", np.asarray(tiny_data.atlas.waist), batch["groups"])
+        step = root[:, 3] - root[:, 2]
+        yaw = np.arctan2(step[:, 0], step[:, 2])
+        asked = np.array([np.nan, 0, np.pi, np.pi / 2, -np.pi / 2])[batch["actions"]]
+        apart = np.abs((yaw - asked + np.pi) % (2 * np.pi) - np.pi)
+        assert np.nanmedian(apart) < 0.2 and np.nanmax(apart) < 1.0
+        np.testing.assert_array_equal(batch["actions"] == 0, before["actions"] == 0)
+        moving = before["actions"] > 0
+        pairs = set(zip(before["actions"][moving].tolist(), batch["actions"][moving].tolist(), strict=True))
+        assert len(pairs) == 16
 
     def test_a_batch_depends_on_its_step_alone(self, stage):
         one, again, other = (stage["batch_at"](k)["groups"] for k in (4, 4, 5))

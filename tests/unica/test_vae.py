@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from avatarjax.nets import functional
 from avatarjax.nets.functional import bind
 from avatarjax.unica import vae
 from avatarjax.unica.vae import VAE, VAEConfig
@@ -78,3 +79,13 @@ def test_divergence_is_the_integral_it_stands_for(mean, variance):
     integral = np.trapezoid(np.exp(log_q) * (log_q - log_p), x)
     full = functools.partial(jnp.full, (1, 3))
     assert float(vae.kl_divergence(full(mean), full(np.log(variance)))) == pytest.approx(integral, abs=1e-4)
+
+
+def test_the_decoder_may_have_more_blocks_than_the_encoder(key):
+    """With three a stage it is Stable Diffusion 1.5's autoencoder, of 84 million parameters."""
+    config = dataclasses.replace(CONFIG, decoder_blocks=3)
+    shapes = functional.shapes(VAE, config)
+    assert len(shapes["down"]) == 3 and len(shapes["up"]) == 9
+    z = jax.ShapeDtypeStruct((2, 2, 2, 4), jnp.float32)
+    assert jax.eval_shape(lambda p, z: bind(VAE, config, p).decode(z), shapes, z).shape == (2, 8, 8, 3)
+    assert functional.count(functional.shapes(VAE, VAEConfig(decoder_blocks=3))) == pytest.approx(83.65e6, rel=0.01)

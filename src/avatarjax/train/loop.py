@@ -34,7 +34,8 @@ def fit(
     `batch_at(k)` gives the batch of step k from k alone, so that a run which was interrupted goes on as if it had not
     been. State is saved to `folder/name.safetensors` twice a minute and at the end; a file that is there is resumed if
     its `fingerprint` (of configuration and data) is this one, and ignored otherwise. Means over about `log_points`
-    intervals go to `folder/name.jsonl`. Raises FloatingPointError when every step of an interval was skipped because
+    intervals go to `folder/name.jsonl`, with the seconds since the run began and the processor time, of all cores
+    together, since this process took it up. Raises FloatingPointError when every step of an interval was skipped because
     its gradient was not finite.
     """
     folder = Path(folder)
@@ -50,6 +51,7 @@ def fit(
 
     every = max(1, steps // log_points)
     began = saved = time.monotonic()
+    busy = time.process_time()
     pending: list[Metrics] = []
     with tqdm(total=steps, initial=start, desc=name, unit="step", dynamic_ncols=True) as bar, log.open("a") as out:
         for k in range(start, steps):
@@ -62,6 +64,7 @@ def fit(
                 if record["skipped"] == 1.0:
                     raise FloatingPointError(f"{name}: no step up to {k + 1} had a finite gradient; lower its rate")
                 record |= {"step": k + 1, "seconds": round(seconds + time.monotonic() - began, 3)}
+                record["processor_seconds"] = round(time.process_time() - busy, 3)
                 out.write(json.dumps(record) + "\n")
                 out.flush()
                 bar.set_postfix(loss=f"{record['loss']:.4g}", refresh=False)
