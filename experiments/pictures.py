@@ -109,6 +109,24 @@ def save_plot(path: Path, draw: Callable[[typing.Any], None], *, size: tuple[flo
         figure.savefig(temporary, dpi=110, format=path.suffix[1:])
 
 
+def save_grid(path: Path, images: Sequence[np.ndarray], titles: Sequence[str], *, columns: int) -> None:
+    """Pictures (h, w, 3) uint8 of one size in rows of `columns`, each under its title, bold where it is a new one."""
+    from matplotlib.figure import Figure
+
+    rows = -(-len(images) // columns)
+    height, width = images[0].shape[:2]
+    figure = Figure(figsize=(1.4 * columns, (1.4 * height / width + 0.25) * rows), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for k, axes in enumerate(grid):
+        axes.set_axis_off()
+        if k < len(images):
+            changed = k > 0 and titles[k] != titles[k - 1]
+            axes.imshow(images[k])
+            axes.set_title(titles[k], fontsize=10, fontweight="bold" if changed else "normal", pad=2)
+    with atomic.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110, format=path.suffix[1:])
+
+
 def plot_losses(path: Path, records: Sequence[dict[str, float]], name: str) -> None:
     """Loss against step, both on the scale that shows it best."""
 

@@ -40,13 +40,17 @@ def measure(
     chosen = np.unique(np.linspace(image_quality.CONTEXT, len(pictures) - 1, NEXT_FRAMES).astype(int))
     key = jax.random.key(experiment.args.seed + 13)
     held = data.held_out_images
+    generated = image_quality.video(avatar, frames.gaussians, frames.root, pictures.shape[2])
     return {
         "poses": {
             "base attributes": _summary(image_quality.appearance_quality(plain, held, perceptual, refined=False)),
             **{n: _summary(image_quality.appearance_quality(a, held, perceptual)) for n, a in dressed.items()},
         },
         "next frame": _summary(image_quality.next_frame_quality(avatar, data.truth, pictures, chosen, key, perceptual)),
-        "fvd": _fvd(image_quality.video(avatar, frames, pictures.shape[2]), image_quality.truth_video(pictures)),
+        "fvd": _fvd(generated, image_quality.truth_video(pictures)),
+            image_quality.video(avatar, frames.gaussians, frames.root, pictures.shape[2]),
+            image_quality.truth_video(pictures),
+        ),
         "pixels": pictures.shape[2],
     }
 

@@ -26,7 +26,7 @@ from avatarjax.splat import SplatConfig, render
 from avatarjax.unica import appearance, photometric
 from avatarjax.unica.avatar import Avatar, in_box, wear, wear_base
 from avatarjax.unica.forecast import state_at
-from avatarjax.unica.rollout import Frame, step
+from avatarjax.unica.rollout import step
 from avatarjax.unica.train_appearance import boxed_points
 
 CONTEXT = 3
@@ -99,8 +99,21 @@ def next_frame_quality(
     return _judge(all_drawn(), perceptual, len(frames))
 
 
-def video(avatar: Avatar, frames: Frame, size: int) -> UInt8[np.ndarray, "v f h w 3"]:
-    """A rollout with Gaussians from the four cardinal views, the cameras following its root, over black."""
+def video_quality(
+    video: UInt8[np.ndarray, "v f h w 3"],
+    pictures: UInt8[np.ndarray, "f v h w 4"],
+    frames: Int[np.ndarray, "g"],
+    perceptual: lpips.Network | None = None,
+) -> Quality:
+    """Of these frames of a video, as `video` makes it, of the very motion that is pictured."""
+    pairs = ((jnp.asarray(video[:, k] / np.float32(255)), pictures[k]) for k in frames)
+    return _judge(pairs, perceptual, len(frames))
+
+
+def video(
+    avatar: Avatar, gaussians: Gaussians, roots: Float[Array | np.ndarray, "f 3"], size: int
+) -> UInt8[np.ndarray, "v f h w 3"]:
+    """World Gaussians of f frames from the four cardinal views, the cameras following the root, over black."""
     cameras = cardinal_cameras(size)
     splat = _splat_config(avatar, np.asarray(avatar.standing), cameras)
 
@@ -108,7 +121,7 @@ def video(avatar: Avatar, frames: Frame, size: int) -> UInt8[np.ndarray, "v f h 
     def drawn(gaussians, root):
         return jnp.round(255 * _draw(_seen_from(gaussians, root), cameras, splat)).astype(jnp.uint8)
 
-    each = (jax.tree.map(lambda x, k=k: jnp.asarray(x[k]), (frames.gaussians, frames.root)) for k in _bar(frames.root))
+    each = (jax.tree.map(lambda x, k=k: jnp.asarray(x[k]), (gaussians, roots)) for k in _bar(roots))
     return np.stack([np.asarray(drawn(*inputs)) for inputs in each], axis=1)
 
 

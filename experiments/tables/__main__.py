@@ -1,0 +1,112 @@
+"""Print UNICA's tables and figures as measured on finished runs, beside the paper's numbers.
+
+    python -m experiments.tables quality                       # Tables 2 and C: all trained avatars
+    python -m experiments.tables steps --avatars cowgirl       # Table B
+    python -m experiments.tables alignment --preset ci         # Table 3: needs a run with the UNet
+    python -m experiments.tables times                         # Table D
+    python -m experiments.tables sliding                       # Fig. 6: 2,000 frames, minutes an avatar
+    python -m experiments.tables components novelty trail strips   # Figs. B, C (f), 5, I to L
+
+Runs are those of `python -m experiments.unica --avatar NAME --train` under OUT/unica/NAME/PRESET. Results go to
+OUT/tables/PRESET/: NAME.md with its pictures, and what was measured in cells.json, so that an interrupted table goes
+on. SV4D and the user study of the paper are not reproduced.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import typing
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import tyro
+
+from avatarjax.data import avatars as known
+from avatarjax.io import atomic
+from avatarjax.metrics import environment
+from avatarjax.unica.config import DynamicsName, PresetName
+from experiments.tables import figures, images, long, quality
+from experiments.tables.finished import Finished
+from experiments.tables.table import Notebook, Table
+
+Name = typing.Literal["quality", "alignment", "steps", "times", "sliding", "components", "novelty", "trail", "strips"]
+
+
+@dataclasses.dataclass
+class Args:
+    """Which tables, of which runs."""
+
+    names: tyro.conf.Positional[tuple[Name, ...]]
+    """Tables to measure, in this order."""
+    preset: PresetName = "small"
+    """Of the runs."""
+    avatars: tuple[str, ...] = ()
+    """Of the runs; default: all that are finished."""
+    dynamics: DynamicsName = "coefficients"
+    """The model whose sampling steps `steps` varies."""
+    rollouts: int = 3
+    """Rollouts behind each FVD of `quality`, `alignment` and `steps`."""
+    out: Path = Path("runs")
+    """Where the runs are, and where the tables go."""
+
+
+def run_tables(args: Args) -> list[Table]:
+    """Measure, print and write the tables. Raises ValueError where there is no finished run."""
+    runs = finished(args)
+    folder = args.out / "tables" / args.preset
+    folder.mkdir(parents=True, exist_ok=True)
+    notebook = Notebook(folder / "cells.json")
+    makers: dict[str, Callable[[], Table]] = {
+        "quality": lambda: quality.quality(runs, notebook, args.rollouts),
+        "alignment": lambda: images.alignment(runs, notebook, args.rollouts),
+        "steps": lambda: images.steps(runs, notebook, args.rollouts, args.dynamics),
+        "times": lambda: long.times(runs, notebook),
+        "sliding": lambda: long.sliding(runs, notebook, folder),
+        "components": lambda: figures.components(runs, notebook, folder),
+        "novelty": lambda: figures.novelty(runs, notebook, folder),
+        "trail": lambda: figures.trail(runs, notebook, folder),
+        "strips": lambda: figures.strips(runs, notebook, folder),
+    }
+    made = []
+    for name in args.names:
+        table = makers[name]()
+        made_on = ", ".join(f"{key} {value}" for key, value in environment.describe().items())
+        text = f"{table.markdown()}\n`python -m experiments.tables {name} --preset {args.preset}` on {made_on}.\n"
+        atomic.write_text(folder / f"{name}.md", text)
+        print(f"\n{text}\nwritten to {folder / name}.md", flush=True)
+        made.append(table)
+    return made
+
+
+def finished(args: Args) -> list[Finished]:
+    """The finished runs that `args` ask for, in the order of the avatars' names."""
+    folders = [args.out / "unica" / name / args.preset for name in args.avatars or known.names()]
+    there = [f for f in folders if (f / "metrics.json").is_file()]
+    missing = [f.parent.name for f in folders if f not in there]
+    if not there or (args.avatars and missing):
+        raise ValueError(
+            f"no finished run of {', '.join(missing)} under {args.out / 'unica'}: "
+            f"train with python -m experiments.unica --avatar {missing[0]} --train --preset {args.preset}"
+        )
+    return [Finished(f) for f in there]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line; errors a user can mend are printed, not traced."""
+    args = tyro.cli(Args, prog="python -m experiments.tables", args=argv, description=__doc__)
+    jax.config.update("jax_compilation_cache_dir", str(args.out.absolute() / ".jax_cache"))
+    try:
+        run_tables(args)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\ninterrupted: run the same command to go on", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
