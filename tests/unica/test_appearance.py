@@ -1,10 +1,14 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from avatarjax import posmap, rotations
+from avatarjax.gaussians import transform
 from avatarjax.nets import functional
-from avatarjax.unica import appearance
+from avatarjax.unica import appearance, avatar, reset, step
 from avatarjax.unica.appearance import AppearanceNetwork
 from tests.parameters import random_params
 
@@ -53,3 +57,46 @@ def test_initial_sizes_follow_the_spacing_of_the_points():
     assert (base.log_scales.max() - base.log_scales.min()) <= np.log(4) + 1e-5
     denser = appearance.initial_base(0.5 * points, jnp.asarray(1.0))
     np.testing.assert_allclose(denser.log_scales, base.log_scales - np.log(2), atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def painted(avatars):
+    """The coefficient model's avatar with an untrained point transformer and long thin Gaussians."""
+    one = avatars["coefficients"]
+    stretch = jnp.asarray([[0.5, 0.0, -1.0]])
+    return one.replace(
+        appearance=functional.init(AppearanceNetwork, one.config.appearance, jax.random.key(0)),
+        base=one.base.replace(log_scales=one.base.log_scales + stretch),
+        config=dataclasses.replace(one.config, appearance_model="point_transformer"),
+    )
+
+
+def changed(one, **changes):
+    settings = dataclasses.replace(one.config.appearance, **changes)
+    return one.replace(config=dataclasses.replace(one.config, appearance=settings))
+
+
+def covariances(cloud):
+    axes = rotations.to_matrix(cloud.quats)
+    return np.asarray(jnp.einsum("nij,nj,nkj->nik", axes, jnp.exp(2 * cloud.log_scales), axes))
+
+
+def test_gaussians_turn_with_the_surface_where_they_are_told_to(painted):
+    """UNICA E: a standing figure that is turned as a whole wears its turned cloud."""
+    wear = jax.jit(avatar.wear)
+    matrix = rotations.to_matrix(rotations.from_axis_angle(jnp.asarray([0.0, 2.0, 0.0])))
+    moved = painted.standing @ matrix.T
+    expected = covariances(transform(wear(painted, painted.standing), 1.0, matrix, jnp.zeros(3)))
+    known = np.repeat(posmap.frames(painted.tangents, painted.standing).known > 0, len(expected) // len(moved))
+    found = covariances(wear(changed(painted, turn=True), moved))
+    assert np.abs(found - expected)[known].max() < 0.02 * expected.max()
+    assert np.abs(covariances(wear(painted, moved)) - expected)[known].max() > 0.1 * expected.max()
+
+
+def test_a_frame_says_for_how_many_voxels_there_was_no_room(painted):
+    stepped = jax.jit(step)
+    narrow = dataclasses.replace(painted.config.appearance.transformer, fill=0.05)
+    for one, enough in ((painted, True), (changed(painted, transformer=narrow), False)):
+        _, frame = stepped(one, reset(one, jax.random.key(0)), 1)
+        assert (int(frame.info.overflow) == 0) == enough
+        assert np.isfinite(frame.gaussians.means).all()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 GROUPS = 8
 
@@ -53,7 +53,7 @@ class ResidualBlock(nnx.Module):
 
 
 class Attention(nnx.Module):
-    """Multi-head attention from tokens to a context, or to themselves."""
+    """Multi-head attention from tokens to a context, or to themselves; a mask says which tokens of it count."""
 
     def __init__(self, features: int, heads: int, context: int | None = None, *, rngs: nnx.Rngs):
         self.heads = heads
@@ -62,10 +62,16 @@ class Attention(nnx.Module):
         self.value = nnx.Linear(context or features, features, use_bias=False, rngs=rngs)
         self.out = nnx.Linear(features, features, rngs=rngs)
 
-    def __call__(self, x: Float[Array, "b n c"], context: Float[Array, "b m d"] | None = None) -> Float[Array, "b n c"]:
+    def __call__(
+        self,
+        x: Float[Array, "b n c"],
+        context: Float[Array, "b m d"] | None = None,
+        mask: Bool[Array, "b m"] | None = None,
+    ) -> Float[Array, "b n c"]:
         context = x if context is None else context
         q, k, v = (self._split(t) for t in (self.query(x), self.key(context), self.value(context)))
-        return self.out(jax.nn.dot_product_attention(q, k, v).reshape(x.shape))
+        mask = None if mask is None else mask[:, None, None, :]
+        return self.out(jax.nn.dot_product_attention(q, k, v, mask=mask).reshape(x.shape))
 
     def _split(self, tokens: Float[Array, "b n c"]) -> Float[Array, "b n heads e"]:
         return tokens.reshape(*tokens.shape[:2], self.heads, -1)

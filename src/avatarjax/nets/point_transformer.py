@@ -1,45 +1,48 @@
-"""A point transformer with static shapes: serialised patch attention in a U-shaped network (PTv3, Wu et al. 2024).
+"""Point Transformer V3 with static shapes: serialised patch attention in a U-shaped network (PTv3, Wu et al. 2024).
 
-Points are sorted along space-filling curves, attention runs inside patches of consecutive points, and pooling joins
-consecutive points of a curve. Against the released PTv3, pooling takes a fixed number of neighbours along the curve
-instead of all points of a voxel, and the positional encoding is a depthwise convolution along the curve instead of a
-sparse one over voxels: every shape is then known before the points are.
+Points are sorted along space-filling curves, attention runs inside patches of consecutive points, pooling joins the
+points of a voxel, and a sparse convolution over occupied voxels is the positional encoding. Normalisation is LayerNorm
+wherever the released PTv3 has BatchNorm: there are no running statistics.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Key
 
-from avatarjax.nets import serialization
+from avatarjax.nets import levels as resolutions
+from avatarjax.nets import submanifold
 from avatarjax.nets.blocks import Attention
+from avatarjax.nets.levels import Level
 
 
 @dataclasses.dataclass(frozen=True)
 class PointTransformerConfig:
-    """Sizes of a point transformer; the defaults are UNICA's (C.1).
+    """Sizes of a point transformer; the defaults are UNICA's (C.1) or, tagged code, the released PTv3's.
 
-    One entry a stage in the encoder tuples, one less in the decoder's. `strides[i]` is the pooling between stages i and
-    i + 1: it joins stride^2 points, as a stride of that many voxels does on a surface.
+    One entry a stage in the encoder tuples, one less in the decoder's. `strides[i]`, a power of two, is how many times
+    as wide the voxels of stage i + 1 are; 1 merges the points of a voxel. A stage after the first has room for `fill`
+    voxels for each voxel of a face of its grid; `overflow` says where that was too few.
     """
 
     inputs: int = 14
     encoder_channels: tuple[int, ...] = (32, 64, 128, 256, 512)
     encoder_depths: tuple[int, ...] = (2, 2, 2, 6, 2)
-    encoder_heads: tuple[int, ...] = (2, 4, 8, 16, 32)
+    encoder_heads: tuple[int, ...] = (2, 4, 8, 16, 32)  # code
     strides: tuple[int, ...] = (1, 2, 2, 2)
     decoder_channels: tuple[int, ...] = (64, 64, 128, 256)
     decoder_depths: tuple[int, ...] = (2, 2, 2, 2)
-    decoder_heads: tuple[int, ...] = (4, 4, 8, 16)
+    decoder_heads: tuple[int, ...] = (4, 4, 8, 16)  # code
     patch: int = 1024
-    grid: int = 192
-    expansion: int = 4
+    grid: int = 192  # code
+    expansion: int = 4  # code
+    shuffle: bool = True  # code: the curves in another order on every level, in training
+    fill: float = 2.0  # ours
 
     def __post_init__(self):
         stages = len(self.encoder_channels)
@@ -47,57 +50,69 @@ class PointTransformerConfig:
         decoder = (self.decoder_channels, self.decoder_depths, self.decoder_heads, self.strides)
         if any(len(t) != stages for t in encoder) or any(len(t) != stages - 1 for t in decoder):
             raise ValueError(f"{stages} encoder stages need {stages} entries there and {stages - 1} elsewhere: {self}")
+        if any(stride < 1 or stride & (stride - 1) for stride in self.strides):
+            raise ValueError(f"strides must be powers of two, not {self.strides}")
 
 
-class CurveConvolution(nnx.Module):
-    """A depthwise convolution along the order of a curve, zero beyond its ends.
-
-    A sum of shifted copies: XLA's depthwise convolution is several times as slow on a CPU.
-    """
-
-    TAPS = 5
+class VoxelConvolution(nnx.Module):
+    """A 3x3x3 convolution over occupied voxels, which have the mean features of their points."""
 
     def __init__(self, channels: int, *, rngs: nnx.Rngs):
-        scale = nnx.initializers.variance_scaling(1.0, "fan_in", "normal", in_axis=0, out_axis=())
-        self.kernel = nnx.Param(scale(rngs.params(), (self.TAPS, channels)))
+        scale = nnx.initializers.lecun_normal(in_axis=(0, 1))
+        self.kernel = nnx.Param(scale(rngs.params(), (len(submanifold.STEPS), channels, channels)))
         self.bias = nnx.Param(jnp.zeros(channels))
 
-    def __call__(self, x: Float[Array, "n c"]) -> Float[Array, "n c"]:
-        reach = self.TAPS // 2
-        padded = jnp.pad(x, ((reach, reach), (0, 0)))
-        taps = [self.kernel[...][None, k] * padded[k : k + len(x)] for k in range(self.TAPS)]
-        return functools.reduce(jnp.add, taps, self.bias[...][None])
+    def __call__(self, x: Float[Array, "n c"], level: Level) -> Float[Array, "m c"]:
+        if level.voxel is not None:
+            counted = jnp.concatenate([x, jnp.ones_like(x[:, :1])], axis=1)
+            total = jax.ops.segment_sum(counted, level.voxel, len(level.neighbours), indices_are_sorted=True)
+            x = total[:, :-1] / jnp.maximum(total[:, -1:], 1.0)
+        return submanifold.convolve(x, self.kernel[...], level.neighbours, level.voxels) + self.bias[...][None]
+
+
+class PatchAttention(nnx.Module):
+    """Attention among each patch of consecutive points on a curve.
+
+    A last, incomplete patch borrows the end of the one before it, so that all are full (PTv3 4.2).
+    """
+
+    def __init__(self, channels: int, heads: int, patch: int, *, rngs: nnx.Rngs):
+        self.patch = patch
+        self.attention = Attention(channels, heads, rngs=rngs)
+
+    def __call__(
+        self, x: Float[Array, "n c"], count: Int[Array, ""], order: Int[Array, "n"], rank: Int[Array, "n"]
+    ) -> Float[Array, "n c"]:
+        n, channels = x.shape
+        size = min(self.patch, n)
+        patches = -(-n // size)
+        starts = jnp.minimum(jnp.arange(patches) * size, jnp.maximum(count - size, 0))
+        rows = starts[:, None] + jnp.arange(size)[None]
+        # Only where all points together do not fill a patch is there padding in it.
+        attended = self.attention(x[order[rows]], mask=rows < count)
+        # A point in two patches takes what the one says that is its own.
+        own = rank // size
+        return attended.reshape(-1, channels)[own * size + rank - starts[own]]
 
 
 class Block(nnx.Module):
-    """Curve convolution, patch attention and MLP, each with a residual connection, in the order of one curve."""
+    """Sparse convolution, patch attention and MLP, each with a residual connection."""
 
     def __init__(self, channels: int, heads: int, patch: int, expansion: int, *, rngs: nnx.Rngs):
-        self.patch = patch
-        self.position = CurveConvolution(channels, rngs=rngs)
+        self.position = VoxelConvolution(channels, rngs=rngs)
+        self.position_out = nnx.Linear(channels, channels, rngs=rngs)
+        self.position_norm = nnx.LayerNorm(channels, rngs=rngs)
         self.norm1 = nnx.LayerNorm(channels, rngs=rngs)
-        self.attention = Attention(channels, heads, rngs=rngs)
+        self.attention = PatchAttention(channels, heads, patch, rngs=rngs)
         self.norm2 = nnx.LayerNorm(channels, rngs=rngs)
         self.up = nnx.Linear(channels, expansion * channels, rngs=rngs)
         self.down = nnx.Linear(expansion * channels, channels, rngs=rngs)
 
-    def __call__(self, x: Float[Array, "n c"], order: Int[Array, "n"]) -> Float[Array, "n c"]:
-        n, channels = x.shape
-        patches = -(-n // self.patch)
-        size = -(-n // patches)
-        # A last, incomplete patch is moved back over points of the one before it, so that all patches are full.
-        starts = jnp.minimum(jnp.arange(patches) * size, n - size)
-        rows = (starts[:, None] + jnp.arange(size)[None]).reshape(-1)
-        # Points that are in both of the last two patches take what the last one says: a gather, so on every device.
-        place = jnp.arange(n)
-        place = jnp.where(place < n - size, place, place + patches * size - n)
-
-        x = x[order]
-        x = x + self.position(x)
-        attended = self.attention(self.norm1(x)[rows].reshape(patches, size, channels)).reshape(-1, channels)
-        x = x + attended[place]
-        x = x + self.down(jax.nn.gelu(self.up(self.norm2(x))))
-        return jnp.zeros_like(x).at[order].set(x, unique_indices=True)
+    def __call__(self, x: Float[Array, "n c"], level: Level, curve: int) -> Float[Array, "n c"]:
+        position = self.position_norm(self.position_out(self.position(x, level)))
+        x = x + (position if level.voxel is None else _rows(position, level.voxel))
+        x = x + self.attention(self.norm1(x), level.count, level.orders[curve], level.ranks[curve])
+        return x + self.down(jax.nn.gelu(self.up(self.norm2(x))))
 
 
 class Stage(nnx.Module):
@@ -108,10 +123,27 @@ class Stage(nnx.Module):
             [Block(channels, heads, config.patch, config.expansion, rngs=rngs) for _ in range(depth)]
         )
 
-    def __call__(self, x: Float[Array, "n c"], orders: Int[Array, "4 n"]) -> Float[Array, "n c"]:
+    def __call__(self, x: Float[Array, "n c"], level: Level) -> Float[Array, "n c"]:
         for k, block in enumerate(self.blocks):
-            x = block(x, orders[k % len(orders)])
+            x = block(x, level, k % len(level.orders))
         return x
+
+
+class Projection(nnx.Module):
+    """Linear, LayerNorm, GELU; from one level to a coarser one, with the maximum over each cluster after the first."""
+
+    def __init__(self, inputs: int, outputs: int, *, rngs: nnx.Rngs):
+        self.linear = nnx.Linear(inputs, outputs, rngs=rngs)
+        self.norm = nnx.LayerNorm(outputs, rngs=rngs)
+
+    def __call__(self, x: Float[Array, "n c"], level: Level | None = None, coarser: Level | None = None):
+        x = self.linear(x)
+        if level is not None and coarser is not None:
+            room = coarser.orders.shape[1]
+            x = jax.ops.segment_max(x, level.parent, room, indices_are_sorted=True)
+            # A place without a cluster has no maximum.
+            x = jnp.where((jnp.arange(room) < coarser.count)[:, None], x, 0.0)
+        return jax.nn.gelu(self.norm(x))
 
 
 class PointTransformer(nnx.Module):
@@ -129,8 +161,7 @@ class PointTransformer(nnx.Module):
                 for c, d, h in zip(enc, config.encoder_depths, config.encoder_heads, strict=True)
             ]
         )
-        self.pool = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in itertools.pairwise(enc)])
-        self.pool_norm = nnx.List([nnx.LayerNorm(c, rngs=rngs) for c in enc[1:]])
+        self.pool = nnx.List([Projection(a, b, rngs=rngs) for a, b in itertools.pairwise(enc)])
         self.decoder = nnx.List(
             [
                 Stage(c, d, h, config, rngs=rngs)
@@ -138,38 +169,42 @@ class PointTransformer(nnx.Module):
             ]
         )
         coarser = (*dec[1:], enc[-1])
-        self.unpool = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in zip(coarser, dec, strict=True)])
-        self.skip = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in zip(enc[:-1], dec, strict=True)])
+        self.unpool = nnx.List([Projection(a, b, rngs=rngs) for a, b in zip(coarser, dec, strict=True)])
+        self.skip = nnx.List([Projection(a, b, rngs=rngs) for a, b in zip(enc[:-1], dec, strict=True)])
 
-    def __call__(self, points: Float[Array, "n 3"], features: Float[Array, "n f"]) -> Float[Array, "n c"]:
-        x = self.embed(features)
-        levels, skips, parents = [self._orders(points)], [], []
+    def __call__(
+        self, points: Float[Array, "n 3"], features: Float[Array, "n f"], key: Key[Array, ""] | None = None
+    ) -> Float[Array, "n c"]:
+        """With a key, each level has the curves in an order of its own (PTv3 4.2); without, in that of CURVES."""
+        along_z, levels = resolutions.build(points, self.config.grid, self.config.strides, self.config.fill)
+        if key is not None:
+            levels = [_shuffled(level, k) for level, k in zip(levels, jax.random.split(key, len(levels)), strict=True)]
+        x = self.embed(features[along_z])
+        skips = []
         for s, stage in enumerate(self.encoder):
-            x = stage(x, levels[-1])
+            x = stage(x, levels[s])
             if s < len(self.pool):
                 skips.append(x)
-                points, x, parent = self._pool(s, points, x, levels[-1][0])
-                parents.append(parent)
-                levels.append(self._orders(points))
+                x = self.pool[s](x, levels[s], levels[s + 1])
         for s in reversed(range(len(self.decoder))):
-            x = self.unpool[s](x)[parents[s]] + self.skip[s](skips[s])
-            x = self.decoder[s](jax.nn.gelu(x), levels[s])
-        return x
+            x = _rows(self.unpool[s](x), levels[s].parent) + self.skip[s](skips[s])
+            x = self.decoder[s](x, levels[s])
+        return jnp.zeros_like(x).at[along_z].set(x, unique_indices=True)
 
-    def _orders(self, points: Float[Array, "n 3"]) -> Int[Array, "4 n"]:
-        voxel = serialization.voxels(points, self.config.grid)
-        bits = max(1, (self.config.grid - 1).bit_length())
-        keys = [serialization.codes(voxel, bits, curve) for curve in serialization.CURVES]
-        return jnp.stack([jnp.argsort(k) for k in keys])
 
-    def _pool(self, stage: int, points: Float[Array, "n 3"], x: Float[Array, "n c"], order: Int[Array, "n"]):
-        """Pooled points (m, 3), their features (m, d), and each point's parent (n,)."""
-        group = self.config.strides[stage] ** 2
-        n = len(order)
-        pooled = -(-n // group)
-        # Repeating the last point changes no maximum and moves only the last group's mean.
-        filled = order[jnp.minimum(jnp.arange(pooled * group), n - 1)]
-        projected = self.pool[stage](x)[filled].reshape(pooled, group, -1)
-        parent = jnp.zeros(n, jnp.int32).at[order].set(jnp.arange(n, dtype=jnp.int32) // group)
-        features = jax.nn.gelu(self.pool_norm[stage](projected.max(1)))
-        return points[filled].reshape(pooled, group, 3).mean(1), features, parent
+def overflow(config: PointTransformerConfig, points: Float[Array, "n 3"]) -> Int[Array, ""]:
+    """How many voxels of points in [0, 1]^3 find no room on their level; 0, or `config.fill` is too small.
+
+    Points there miss the positional encoding, or what their stage would learn from the coarser ones.
+    """
+    return resolutions.dropped(points, config.grid, config.strides, config.fill)
+
+
+def _rows(x: Float[Array, "m c"], row: Int[Array, "n"]) -> Float[Array, "n c"]:
+    """Rows of x; zeros past its end."""
+    return x.at[row].get(mode="fill", fill_value=0)
+
+
+def _shuffled(level: Level, key: Key[Array, ""]) -> Level:
+    curves = jax.random.permutation(key, len(level.orders))
+    return level._replace(orders=level.orders[curves], ranks=level.ranks[curves])

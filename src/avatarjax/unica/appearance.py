@@ -12,9 +12,11 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Key
 
+from avatarjax import posmap, rotations
 from avatarjax.gaussians import Gaussians
+from avatarjax.nets import point_transformer
 from avatarjax.nets.functional import Params, bind
 from avatarjax.nets.point_transformer import PointTransformer, PointTransformerConfig
 
@@ -41,13 +43,15 @@ class BaseAttributes:
 class AppearanceConfig:
     """The point transformer's sizes and its heads'; defaults are the paper's.
 
-    `offset_bound` bounds the correction of the means, in box units (the paper's tanh: 1).
+    `offset_bound` bounds the correction of the means, in box units (the paper's tanh: 1). `turn` turns the coarse
+    Gaussians with the surface, as UNICA E proposes for its failures in turns.
     """
 
     transformer: PointTransformerConfig = PointTransformerConfig()
     head_width: int = 128
     head_layers: int = 4
     offset_bound: float = 1.0
+    turn: bool = False  # ours: on
 
 
 class AppearanceNetwork(nnx.Module):
@@ -70,8 +74,10 @@ class AppearanceNetwork(nnx.Module):
         layers.append(nnx.Linear(width, outputs, kernel_init=nnx.initializers.zeros, rngs=rngs))
         return nnx.Sequential(*layers)
 
-    def __call__(self, points: Float[Array, "n 3"], attributes: Float[Array, "n 14"]) -> dict[str, Float[Array, "n _"]]:
-        features = jnp.concatenate([self.transformer(points, attributes), attributes], axis=-1)
+    def __call__(
+        self, points: Float[Array, "n 3"], attributes: Float[Array, "n 14"], key: Key[Array, ""] | None = None
+    ) -> dict[str, Float[Array, "n _"]]:
+        features = jnp.concatenate([self.transformer(points, attributes, key), attributes], axis=-1)
         return {name: head(features) for name, head in self.heads.items()}
 
 
@@ -108,8 +114,22 @@ def coarse_gaussians(base: BaseAttributes, points: Float[Array, "n 3"], height: 
     )
 
 
-def refine(config: AppearanceConfig, params: Params, coarse: Gaussians) -> Gaussians:
-    """G_refined = G_coarse + delta G (UNICA Eq. 6), in box units."""
+def turned(quats: Float[Array, "n 4"], before: posmap.Frames, after: posmap.Frames) -> Float[Array, "n 4"]:
+    """Orientations of the upscaled points, turned as the surface at their texel has from one pose to another."""
+    turns = posmap.turns(before, after, jnp.asarray([1.0, 0.0, 0.0, 0.0]))
+    return rotations.multiply(jnp.repeat(turns, len(quats) // len(turns), axis=0), quats)
+
+
+def turned_base(
+    base: BaseAttributes, tangents: posmap.Tangents, standing: Float[Array, "t 3"], texels: Float[Array, "t 3"]
+) -> BaseAttributes:
+    """Base attributes turned as the surface has from the standing pose's texels to these, both in one unit."""
+    before, after = (posmap.frames(tangents, t) for t in (standing, texels))
+    return base.replace(quats=turned(base.quats, before, after))
+
+
+def refine(config: AppearanceConfig, params: Params, coarse: Gaussians, key: Key[Array, ""] | None = None) -> Gaussians:
+    """G_refined = G_coarse + delta G (UNICA Eq. 6), in box units; a key shuffles the curves, for training."""
     stacked = jnp.concatenate(
         [
             coarse.means,
@@ -121,7 +141,7 @@ def refine(config: AppearanceConfig, params: Params, coarse: Gaussians) -> Gauss
         ],
         axis=-1,
     )
-    delta = bind(AppearanceNetwork, config, params)(coarse.means + 0.5, stacked)
+    delta = bind(AppearanceNetwork, config, params)(coarse.means + 0.5, stacked, key)
     return coarse.replace(
         means=coarse.means + config.offset_bound * jnp.tanh(delta["means"]),
         colors=coarse.colors + delta["colors"],
@@ -129,3 +149,8 @@ def refine(config: AppearanceConfig, params: Params, coarse: Gaussians) -> Gauss
         quats=coarse.quats + delta["quats"],
         logit_opacities=coarse.logit_opacities + delta["logit_opacities"][:, 0],
     )
+
+
+def overflow(config: AppearanceConfig, points: Float[Array, "n 3"]) -> Int[Array, ""]:
+    """How many voxels of points in box units find no room in the point transformer: 0, or its `fill` is too small."""
+    return point_transformer.overflow(config.transformer, points + 0.5)

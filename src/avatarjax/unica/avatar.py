@@ -6,7 +6,7 @@ import typing
 
 import flax.struct
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from avatarjax import posmap
 from avatarjax.gaussians import Gaussians
@@ -62,10 +62,21 @@ def wear_base(avatar: Avatar, texels: Float[Array, "t 3"], *, refined: bool = Fa
     there into the world (UNICA 3.5, 3.7)."""
     points = posmap.upscale(avatar.upscaler, texels)
     box = posmap.bounding_box(points)
-    cloud = appearance.coarse_gaussians(avatar.base, posmap.into_box(box, points), box.side)
+    base = avatar.base
+    if refined and avatar.config.appearance.turn:
+        base = appearance.turned_base(base, avatar.tangents, avatar.standing, texels)
+    cloud = appearance.coarse_gaussians(base, posmap.into_box(box, points), box.side)
     if refined:
         cloud = appearance.refine(avatar.config.appearance, avatar.appearance, cloud)
     return align.place(cloud, points)
+
+
+def overflow(avatar: Avatar, texels: Float[Array, "t 3"]) -> Int[Array, ""]:
+    """How many voxels of a posed surface the point transformer has no room for; 0 with the texel head."""
+    if avatar.config.appearance_model == "texels":
+        return jnp.asarray(0)
+    points = posmap.upscale(avatar.upscaler, texels)
+    return appearance.overflow(avatar.config.appearance, posmap.into_box(posmap.bounding_box(points), points))
 
 
 def in_box(gaussians: Gaussians, box: Box) -> Gaussians:

@@ -18,7 +18,7 @@ from avatarjax import posmap
 from avatarjax.gaussians import Gaussians
 from avatarjax.posmap import pca as pcs
 from avatarjax.unica import coefficients, latent
-from avatarjax.unica.avatar import Avatar, wear
+from avatarjax.unica.avatar import Avatar, overflow, wear
 from avatarjax.unica.latent import LatentDynamics
 
 
@@ -39,13 +39,16 @@ class State:
 @typing.no_type_check
 @flax.struct.dataclass
 class Info:
-    """What a user may want to watch: how far alignment moved the generated texels, and the lowest texel's height.
+    """What a user may want to watch: how far alignment moved the generated texels, the lowest texel's height, and for
+    how many voxels the point transformer had no room.
 
-    pca_residual () root mean square in metres; ground () metres, 0 for a foot on the floor: a trend is vertical drift.
+    pca_residual () root mean square in metres; ground () metres, 0 for a foot on the floor: a trend is vertical drift;
+    overflow () 0 if all is well, or if no Gaussians were asked for.
     """
 
     pca_residual: Float[Array, ""]
     ground: Float[Array, ""]
+    overflow: Int[Array, ""]
 
 
 @typing.no_type_check
@@ -95,10 +98,15 @@ def rollout(
 
 def dress(avatar: Avatar, frame: Frame) -> Gaussians:
     """World Gaussians of a frame's geometry."""
+    return wear(avatar, _surface(avatar, frame))
+
+
+def _surface(avatar: Avatar, frame: Frame) -> Float[Array, "t 3"]:
+    """World texels of a frame's geometry, aligned."""
     texels = posmap.from_map(avatar.atlas, frame.posmap)
     # The map is normalised about the root of the frame before; its own root tells where that is in the world.
     origin = frame.root - (posmap.root(avatar.atlas, texels) - 0.5) / avatar.atlas.scale
-    return wear(avatar, posmap.denormalize(avatar.atlas, _aligned(avatar, texels), origin))
+    return posmap.denormalize(avatar.atlas, _aligned(avatar, texels), origin)
 
 
 def _aligned(avatar: Avatar, texels: Float[Array, "t 3"]) -> Float[Array, "t 3"]:
@@ -117,10 +125,12 @@ def _step(avatar: Avatar, state: State, action: Int[Array, ""], gaussians: bool)
     info = Info(
         pca_residual=jnp.sqrt(jnp.mean(jnp.sum(residual**2, axis=-1))),
         ground=jnp.min(texels[:, 1] - 0.5) / avatar.atlas.scale + state.offset[1],
+        overflow=jnp.asarray(0),
     )
     frame = Frame(posmap.to_map(avatar.atlas, texels), None, root, info)
     if gaussians:
-        frame = frame.replace(gaussians=dress(avatar, frame))
+        surface = _surface(avatar, frame)
+        frame = frame.replace(gaussians=wear(avatar, surface), info=info.replace(overflow=overflow(avatar, surface)))
     return State(context, root, key), frame
 
 

@@ -17,11 +17,12 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float, Int, Key
 
-from avatarjax import posmap, rotations
+from avatarjax import posmap
 from avatarjax.gaussians import Gaussians
 from avatarjax.nets import functional
 from avatarjax.nets.functional import Params
 from avatarjax.posmap import Tangents, Upscaler
+from avatarjax.unica import appearance
 from avatarjax.unica.appearance import BaseAttributes
 
 # What the network corrects: places along the texel's own axes, colours, log-scales and opacities.
@@ -86,11 +87,9 @@ def wear(
     offset = config.offset_bound * jnp.tanh(delta[:, :3])
     moved = place + jnp.einsum("tij,tj->ti", after.axes, offset)
     fine = posmap.upscale(upscaler, jnp.concatenate([moved, delta[:, 3:]], axis=-1))
-    count = fine.shape[0] // texels.shape[0]
     quats = base.quats
     if config.turn:
-        turned = posmap.turns(before, after, jnp.asarray([1.0, 0.0, 0.0, 0.0]))
-        quats = rotations.multiply(jnp.repeat(turned, count, axis=0), quats)
+        quats = appearance.turned(quats, before, after)
     return Gaussians(
         means=fine[:, :3] + root[None],
         colors=base.colors + fine[:, 3:6],

@@ -85,15 +85,20 @@ def train_appearance(
 
     Without a `perceptual` network the loss has no LPIPS term.
     """
+    network = config.appearance
 
-    def dressed(params, fixed, texels):
+    def dressed(params, fixed, texels, key):
         points, side = boxed_points(fixed["upscaler"], texels)
-        coarse = appearance.coarse_gaussians(fixed["base"], points, side)
-        return appearance.refine(config.appearance, params, coarse)
+        worn = fixed["base"]
+        if network.turn:
+            worn = appearance.turned_base(worn, fixed["tangents"], fixed["standing"], texels)
+        coarse = appearance.coarse_gaussians(worn, points, side)
+        refined = appearance.refine(network, params, coarse, key if network.transformer.shuffle else None)
+        return refined, {"overflow": appearance.overflow(network, points).astype(jnp.float32)}
 
-    initial = functional.init(appearance.AppearanceNetwork, config.appearance, run.key("appearance"))
-    fixed = {"upscaler": upscaler, "base": base}
-    stage, settings = config.appearance_stage, (config.appearance, config.base_stage)
+    initial = functional.init(appearance.AppearanceNetwork, network, run.key("appearance"))
+    fixed = {"upscaler": upscaler, "base": base, "tangents": posmap.tangents(data.atlas), "standing": data.standing}
+    stage, settings = config.appearance_stage, (network, config.base_stage)
     return _train_on_poses(config, data, run, "appearance", stage, settings, initial, fixed, dressed, perceptual)
 
 
@@ -110,11 +115,12 @@ def train_texels(
     The base attributes have seen only the standing pose until then; what it hides, other poses show.
     """
 
-    def dressed(params, fixed, texels):
+    def dressed(params, fixed, texels, key):
         box = posmap.bounding_box(posmap.upscale(fixed["upscaler"], texels))
         worn = fixed["base"].replace(**params["base"])
         surface = fixed["upscaler"], fixed["tangents"], fixed["standing"]
-        return in_box(texel_head.wear(config.texel_head, params["head"], worn, *surface, texels, jnp.zeros(3)), box)
+        cloud = texel_head.wear(config.texel_head, params["head"], worn, *surface, texels, jnp.zeros(3))
+        return in_box(cloud, box), {}
 
     initial = {
         "head": texel_head.init(config.texel_head, len(data.atlas.rows), run.key("texels")),
@@ -135,13 +141,13 @@ def _train_on_poses(
     settings: tuple[typing.Any, ...],
     initial: Params,
     fixed: dict[str, typing.Any],
-    dressed: Callable[[Params, dict[str, typing.Any], jax.Array], Gaussians],
+    dressed: Callable[[Params, dict[str, typing.Any], jax.Array, jax.Array], tuple[Gaussians, dict[str, jax.Array]]],
     perceptual: lpips.Network | None,
 ) -> Params:
-    """Train what makes Gaussians in the box of a pose; `fixed` is what else it needs."""
+    """Train what makes Gaussians in the box of a pose, and metrics, from parameters, `fixed`, texels and a key."""
     images = data.train_images
     cameras = cylinder_cameras(images.rgba.shape[-2])
-    cloud = jax.jit(dressed)(initial, fixed, jnp.asarray(images.texels[0]))
+    cloud, _ = jax.jit(dressed)(initial, fixed, jnp.asarray(images.texels[0]), run.key(name))
     splat = photometric.splat_config(cloud, cameras)
     k = min(config.views_per_step, images.view.shape[1])
 
@@ -160,12 +166,12 @@ def _train_on_poses(
 
     def loss(params, key, batch):
         # The network runs outside the loop over poses: inside one, XLA's CPU backend uses a single core.
-        clouds = jax.vmap(lambda texels: dressed(params, batch["fixed"], texels))(batch["texels"])
+        clouds, watched = jax.vmap(lambda texels: dressed(params, batch["fixed"], texels, key))(batch["texels"])
         value, metrics = jax.lax.map(
             lambda pose: photometric.loss(config, *pose, splat, batch["perceptual"]),
             (clouds, batch["views"], batch["rgba"], batch["white"]),
         )
-        return jnp.mean(value), jax.tree.map(jnp.mean, metrics)
+        return jnp.mean(value), jax.tree.map(jnp.mean, metrics | watched)
 
     settings = (*settings, config.views_per_step, *photometric.settings(config, perceptual))
     return train_stage(run, name, stage, settings, loss, initial, batch_at)
