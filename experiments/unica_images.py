@@ -48,9 +48,6 @@ def measure(
         },
         "next frame": _summary(image_quality.next_frame_quality(avatar, data.truth, pictures, chosen, key, perceptual)),
         "fvd": _fvd(generated, image_quality.truth_video(pictures)),
-            image_quality.video(avatar, frames.gaussians, frames.root, pictures.shape[2]),
-            image_quality.truth_video(pictures),
-        ),
         "pixels": pictures.shape[2],
     }
 
