@@ -184,6 +184,11 @@ def test_strides_that_are_no_powers_of_two_are_refused(stride):
         PointTransformerConfig(strides=(1, 2, 2, stride))
 
 
+def test_a_grid_too_fine_for_its_codes_is_refused():
+    with pytest.raises(ValueError, match=r"2 to 1024 voxels an edge.*not 2000"):
+        PointTransformerConfig(grid=2000)
+
+
 def test_the_papers_network_has_46_million_parameters():
     """PTv3 gives 46.2 million for these sizes; its stem and head are a convolution and a classifier."""
     count = functional.count(functional.shapes(PointTransformer, PointTransformerConfig()))

@@ -37,6 +37,12 @@ def test_a_hilbert_curve_walks_from_face_to_face(bits, curve):
     np.testing.assert_array_equal(np.abs(np.diff(path, axis=0)).sum(1), 1)
 
 
+@pytest.mark.parametrize("curve", serialization.CURVES)
+def test_without_its_last_three_bits_a_code_is_that_of_the_voxel_twice_as_wide(key, curve):
+    voxel = jax.random.randint(key, (100, 3), 0, 64)
+    np.testing.assert_array_equal(serialization.codes(voxel, 6, curve) >> 3, serialization.codes(voxel >> 1, 5, curve))
+
+
 @pytest.mark.parametrize("curve", ["z", "hilbert"])
 def test_the_transposed_curve_swaps_x_and_y(key, curve):
     voxel = jax.random.randint(key, (50, 3), 0, 32)

@@ -6,7 +6,7 @@ import pytest
 from avatarjax.nets import submanifold
 
 SIDE = 7
-ROOM = 70
+ROOM = 60
 
 
 @pytest.fixture(scope="module", params=[submanifold._TILE, 32], ids=["one tile", "tiles that overlap"])

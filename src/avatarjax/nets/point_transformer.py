@@ -52,6 +52,8 @@ class PointTransformerConfig:
             raise ValueError(f"{stages} encoder stages need {stages} entries there and {stages - 1} elsewhere: {self}")
         if any(stride < 1 or stride & (stride - 1) for stride in self.strides):
             raise ValueError(f"strides must be powers of two, not {self.strides}")
+        if not 1 < self.grid <= 1024:
+            raise ValueError(f"a grid has 2 to 1024 voxels an edge, whose codes fit into 32 bits, not {self.grid}")
 
 
 class VoxelConvolution(nnx.Module):
