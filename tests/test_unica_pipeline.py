@@ -1,17 +1,23 @@
 """The main job end to end at the smallest sizes: every stage, both models, the report, and a second run that reuses."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import avatarjax as aj
 from avatarjax.unica import config as configs
 from avatarjax.unica.config import StageConfig
 from experiments import unica as experiment
+from experiments.tables import __main__ as tables
+from experiments.tables import figures, quality
+from experiments.tables.finished import Finished
 
 CI = configs.preset("ci")
+SCRIPT = (1,) * 8 + (2,) * 8 + (0,) * 4
 
 
 def tiny():
@@ -44,7 +50,7 @@ def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(configs.PRESETS, "ci", tiny)
-        patch.setattr(experiment, "SCRIPT", (1,) * 8 + (2,) * 8 + (0,) * 4)
+        patch.setattr(experiment, "SCRIPT", SCRIPT)
         yield experiment.run_experiment(experiment.Args(preset="ci", out=out))
 
 
@@ -85,6 +91,35 @@ def test_the_report_names_every_stage_and_embeds_its_pictures(finished):
         assert text in page
     assert page.count("data:image/png;base64") >= 8
     assert page.count("data:video/mp4;base64") == 1
+
+
+def test_figures_are_made_of_it(finished, capsys):
+    args = tables.Args(names=("components", "novelty", "strips"), preset="ci", out=finished.parents[2])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "SCRIPT", SCRIPT)
+        made = tables.run_tables(args)
+        assert "measuring cowgirl-ci, components" in capsys.readouterr().out
+        tables.run_tables(dataclasses.replace(args, names=("components",)))
+        assert "measuring" not in capsys.readouterr().out
+    folder = args.out / "tables" / "ci"
+    for table, name in zip(made, args.names, strict=True):
+        assert (folder / f"{name}.md").read_text().startswith(table.markdown())
+        assert table.pictures and all((folder / file).stat().st_size > 1000 for file, _ in table.pictures)
+    errors = made[0].rows[0][1:]
+    assert all(b < a for a, b in itertools.pairwise(errors))
+
+
+def test_rigging_follows_the_true_skeleton(finished, monkeypatch):
+    monkeypatch.setattr(quality, "EXAMPLES", 20)
+    run = Finished(finished)
+    posed, roots = quality.rigged_truth(run)
+    truth = run.data.truth.texels[: len(posed)] + run.data.truth.roots[: len(posed), None]
+
+    def error(texels):
+        return np.linalg.norm(texels - truth, axis=-1).mean()
+
+    stiff = run.data.train.texels.mean(0)[None] + roots[:, None]
+    assert error(posed) < 0.3 * error(stiff)
 
 
 def test_a_second_run_reuses_what_is_finished(finished, capsys):

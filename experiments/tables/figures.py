@@ -29,7 +29,6 @@ COUNTS = (1, 5, 10, 20, 40, 80, 120, 160, 200, 256)  # components; the paper's c
 POSES = 400
 TRAIL = 3  # every third frame, as UNICA Fig. 5
 STRIP = 16  # frames of a strip of keys
-EVENTS = (("sprint start", 0), ("180 degree turn", 60), ("90 degree turn", 120), ("stop", 180))
 
 
 def components(runs: list[Finished], notebook: Notebook, folder: Path) -> Table:
@@ -120,17 +119,20 @@ def trail(runs: list[Finished], notebook: Notebook, folder: Path) -> Table:
 def strips(runs: list[Finished], notebook: Notebook, folder: Path) -> Table:
     """UNICA Figs. I to L: consecutive frames with the key of each, of a start, two turns and a stop."""
     shown = []
+    changes = [k for k in range(len(SCRIPT)) if k == 0 or SCRIPT[k] != SCRIPT[k - 1]]
     for run in runs:
         frames = _rolled(run.avatar(), gaussians=True)
-        for event, first in EVENTS:
-            begin = max(0, first - 2)
+        for change in changes:
+            begin = max(0, change - 2)
             part = jax.tree.map(lambda x, b=begin: jnp.asarray(x[b : b + STRIP]), (frames.gaussians, frames.root))
-            views = list(pictures.draw_frames(*part, run.pictures.shape[2], label=event))
+            keys = [ACTIONS[key] for key in SCRIPT[begin : begin + STRIP]]
+            event = f"{ACTIONS[SCRIPT[change - 1]] if change else 'standing'} to {ACTIONS[SCRIPT[change]]}"
+            views = pictures.draw_frames(*part, run.pictures.shape[2], label=event)
             path = folder / f"keys-{run.name}-{event.replace(' ', '-')}.png"
-            keys = [ACTIONS[SCRIPT[k]] for k in range(begin, begin + len(views))]
-            pictures.save_grid(path, [_corner(v) for v in views], keys, columns=STRIP // 2)
+            # The left side shows running forward best.
+            pictures.save_grid(path, [v[1] for v in views], keys, columns=STRIP // 2)
             shown.append((path.name, f"{run.name}, {event}: consecutive frames with the key that made each"))
-    caption = "Each frame under the key that drives to it, left to right, top to bottom; a change of key is marked."
+    caption = "Consecutive frames under the keys that drive to them, left to right, top to bottom; a new key is bold."
     return Table("Keys and frames (UNICA Figs. I to L)", caption, [], [], pictures=shown)
 
 
@@ -155,11 +157,6 @@ def _portrait(cloud: Gaussians, size: int) -> np.ndarray:
         out = render(raised, camera, config=config)
         pair.append(_bytes(out.image + (1 - out.alpha)[..., None] * pictures.SKY))
     return np.concatenate(pair, axis=1)
-
-
-def _corner(views: np.ndarray) -> np.ndarray:
-    """The left side, where running forward is seen best."""
-    return views[1]
 
 
 def _bytes(picture: typing.Any) -> np.ndarray:
