@@ -6,8 +6,8 @@
 
 Models: `coefficients` (ours), `unet-paper` (UNICA's recipe to the letter), `unet` (the preset's), `unet-turned` (the
 preset's, trained on groups turned by quarters as well). A model's number of steps follows from how long a step takes,
-compilation left out; the UNet shares its seconds with its autoencoder. On a CPU seconds are those of all cores together,
-so that a comparison stays fair on a machine that does other things as well. Results lie in
+compilation left out; the UNet shares its seconds with its autoencoder. On a CPU, seconds are those of all cores
+together, so that a comparison stays fair on a machine that does other things as well. Results lie in
 OUT/unica_dynamics/AVATAR/PRESET-SCRIPTS/SECONDSs/: dynamics.json, dynamics.md and plots. A second run reuses what is
 finished, an interrupted one goes on.
 """

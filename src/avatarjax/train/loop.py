@@ -35,8 +35,8 @@ def fit(
     been. State is saved to `folder/name.safetensors` twice a minute and at the end; a file that is there is resumed if
     its `fingerprint` (of configuration and data) is this one, and ignored otherwise. Means over about `log_points`
     intervals go to `folder/name.jsonl`, with the seconds since the run began and the processor time, of all cores
-    together, since this process took it up. Raises FloatingPointError when every step of an interval was skipped because
-    its gradient was not finite.
+    together, since this process took it up. Raises FloatingPointError when every step of an interval was skipped
+    because its gradient was not finite.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
