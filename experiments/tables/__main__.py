@@ -59,7 +59,7 @@ def run_tables(args: Args) -> list[Table]:
     folder.mkdir(parents=True, exist_ok=True)
     notebook = Notebook(folder / "cells.json")
     makers: dict[str, Callable[[], Table]] = {
-        "quality": lambda: quality.quality(runs, notebook, args.rollouts),
+        "quality": lambda: quality.quality(runs, notebook, args.rollouts, folder),
         "alignment": lambda: images.alignment(runs, notebook, args.rollouts),
         "steps": lambda: images.steps(runs, notebook, args.rollouts, args.dynamics),
         "times": lambda: long.times(runs, notebook),

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from avatarjax import posmap
 from avatarjax.data.dataset import Dataset, cylinder_cameras
@@ -99,7 +100,8 @@ def train_appearance(
     initial = functional.init(appearance.AppearanceNetwork, network, run.key("appearance"))
     fixed = {"upscaler": upscaler, "base": base, "tangents": posmap.tangents(data.atlas), "standing": data.standing}
     stage, settings = config.appearance_stage, (network, config.base_stage)
-    return _train_on_poses(config, data, run, "appearance", stage, settings, initial, fixed, dressed, perceptual)
+    poses = data.train_images.texels
+    return _train_on_poses(config, data, run, "appearance", stage, settings, initial, fixed, poses, dressed, perceptual)
 
 
 def train_texels(
@@ -109,14 +111,19 @@ def train_texels(
     upscaler: posmap.Upscaler,
     base: appearance.BaseAttributes,
     perceptual: lpips.Network | None = None,
+    *,
+    surfaces: Float[np.ndarray, "p t 3"] | None = None,
 ) -> tuple[Params, appearance.BaseAttributes]:
     """The texel head, in the same way and with the same loss as the point transformer, and base attributes with it.
 
-    The base attributes have seen only the standing pose until then; what it hides, other poses show.
+    The base attributes have seen only the standing pose until then; what it hides, other poses show. The head sees
+    the pictured surfaces or, for a baseline that does not know them, the given ones, metres relative to the same roots.
     """
+    seen = data.train_images.texels if surfaces is None else surfaces
 
-    def dressed(params, fixed, texels, key):
-        box = posmap.bounding_box(posmap.upscale(fixed["upscaler"], texels))
+    def dressed(params, fixed, pose, key):
+        pictured, texels = pose
+        box = posmap.bounding_box(posmap.upscale(fixed["upscaler"], pictured))
         worn = fixed["base"].replace(**params["base"])
         surface = fixed["upscaler"], fixed["tangents"], fixed["standing"]
         cloud = texel_head.wear(config.texel_head, params["head"], worn, *surface, texels, jnp.zeros(3))
@@ -128,7 +135,8 @@ def train_texels(
     }
     fixed = {"upscaler": upscaler, "base": base, "tangents": posmap.tangents(data.atlas), "standing": data.standing}
     stage, settings = config.texels_stage, (config.texel_head, config.base_stage)
-    trained = _train_on_poses(config, data, run, "texels", stage, settings, initial, fixed, dressed, perceptual)
+    poses = data.train_images.texels, seen
+    trained = _train_on_poses(config, data, run, "texels", stage, settings, initial, fixed, poses, dressed, perceptual)
     return trained["head"], base.replace(**trained["base"])
 
 
@@ -141,13 +149,17 @@ def _train_on_poses(
     settings: tuple[typing.Any, ...],
     initial: Params,
     fixed: dict[str, typing.Any],
-    dressed: Callable[[Params, dict[str, typing.Any], jax.Array, jax.Array], tuple[Gaussians, dict[str, jax.Array]]],
+    inputs: typing.Any,
+    dressed: Callable[[Params, dict[str, typing.Any], typing.Any, jax.Array], tuple[Gaussians, dict[str, jax.Array]]],
     perceptual: lpips.Network | None,
 ) -> Params:
-    """Train what makes Gaussians in the box of a pose, and metrics, from parameters, `fixed`, texels and a key."""
+    """Train what makes Gaussians in the box of a pose, and metrics, from parameters, `fixed`, a pose and a key.
+
+    `inputs` are the pictured poses, a pytree of arrays (p, ...).
+    """
     images = data.train_images
     cameras = cylinder_cameras(images.rgba.shape[-2])
-    cloud, _ = jax.jit(dressed)(initial, fixed, jnp.asarray(images.texels[0]), run.key(name))
+    cloud, _ = jax.jit(dressed)(initial, fixed, jax.tree.map(lambda x: jnp.asarray(x[0]), inputs), run.key(name))
     splat = photometric.splat_config(cloud, cameras)
     k = min(config.views_per_step, images.view.shape[1])
 
@@ -158,7 +170,7 @@ def _train_on_poses(
         return {
             "fixed": fixed,
             "perceptual": perceptual,
-            "texels": images.texels[poses],
+            "poses": jax.tree.map(lambda x: x[poses], inputs),
             "views": photometric.pick_views(cameras, images.view[poses[:, None], slots]),
             "rgba": images.rgba[poses[:, None], slots],
             "white": rng.integers(0, 2, stage.batch).astype(np.float32),
@@ -166,7 +178,7 @@ def _train_on_poses(
 
     def loss(params, key, batch):
         # The network runs outside the loop over poses: inside one, XLA's CPU backend uses a single core.
-        clouds, watched = jax.vmap(lambda texels: dressed(params, batch["fixed"], texels, key))(batch["texels"])
+        clouds, watched = jax.vmap(lambda pose: dressed(params, batch["fixed"], pose, key))(batch["poses"])
         value, metrics = jax.lax.map(
             lambda pose: photometric.loss(config, *pose, splat, batch["perceptual"]),
             (clouds, batch["views"], batch["rgba"], batch["white"]),
