@@ -262,10 +262,10 @@ def table(args: Args, results: Results, controller: dict[str, typing.Any]) -> st
 
 def next_frame(runs: Sequence[dict[str, typing.Any]], of: str, turning: bool) -> str:
     """Mean over seeds of one error of the next frame, its interval over sequences, and the range of the seeds."""
-    if of not in runs[0]["next_frame"]:
-        return ""
     part = runs[0]["next_frame"]
-    keep = np.array(part["turning"], bool) if turning else np.ones(len(part["turning"]), bool)
+    keep = np.array(part["turning"], bool) | (not turning)
+    if of not in part or not keep.any():
+        return "none"
     each = np.array([r["next_frame"][of] for r in runs])[:, keep]
     estimate = bootstrap(each.mean(0), np.array(part["sequence"])[keep])
     spread = f" ({each.mean(1).min():.1f} to {each.mean(1).max():.1f})" if len(runs) > 1 and of == "model" else ""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import typing
 
 import numpy as np
 import pytest
@@ -13,17 +14,18 @@ from experiments import unica_dynamics_measures as measures
 from tests.unica.conftest import TINY
 
 MODELS = ("coefficients", "unet-turned")
+STEPS = {"coefficients": 3, "vae": 2, "unet": 2}
 
 
 @pytest.fixture(scope="module")
 def compared(tiny_data, tmp_path_factory):
     """The folder of a comparison that was run, and its arguments."""
-    args = dynamics.Args(models=MODELS, seeds=2, seconds=0.2, frames=65, out=tmp_path_factory.mktemp("runs"))
+    args = dynamics.Args(models=MODELS, seeds=1, frames=65, out=tmp_path_factory.mktemp("runs"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(configs.PRESETS, "ci", lambda: TINY)
         patch.setattr(dynamics, "prepare_data", lambda *_: tiny_data)
         patch.setattr(dataset, "fingerprint", lambda _: "tiny")
-        patch.setattr(dynamics, "PROBE", 4)
+        patch.setattr(dynamics, "timed_config", lambda _, config, *__: dynamics.with_counts(config, STEPS))
         for name, value in {"GROUPS": 6, "STEP_GROUPS": 3, "SAMPLING_STEPS": (1, 2), "AHEAD": 3, "TIMED": 2}.items():
             patch.setattr(measures, name, value)
         folder = dynamics.run(args)
@@ -44,11 +46,10 @@ def test_all_numbers_and_plots_are_written(compared):
     folder, _ = compared
     whole = json.loads((folder / "dynamics.json").read_text())
     for name in MODELS:
-        assert len(whole["models"][name]) == 2
-        for run in whole["models"][name]:
-            assert np.isfinite(run["next_frame"]["model"]).all() and len(run["next_frame"]["model"]) == 6
-            assert list(run["sampling_steps"]) == ["1", "2"] and len(run["diversity"]["pose"]) == 3
-            assert run["ms_a_frame"] > 0 and 0 <= run["rollout"]["obeyed"] <= 1
+        (run,) = whole["models"][name]
+        assert np.isfinite(run["next_frame"]["model"]).all() and len(run["next_frame"]["model"]) == 6
+        assert list(run["sampling_steps"]) == ["1", "2"] and len(run["diversity"]["pose"]) == 3
+        assert run["ms_a_frame"] > 0 and set(run["seconds"]) == set(run["steps"]) <= set(STEPS)
     assert "autoencoder" in whole["models"]["unet-turned"][0]["next_frame"]
     for name in ("sampling_steps.png", "diversity.png", "path.png"):
         assert (folder / name).stat().st_size > 1000
@@ -59,11 +60,36 @@ def test_a_second_run_trains_nothing(compared):
     assert before == {p: p.stat().st_mtime_ns for p in folder.rglob("*.safetensors")}
 
 
-def test_seeds_differ_and_take_the_same_steps(compared):
-    whole = json.loads((compared[0] / "dynamics.json").read_text())["models"]["coefficients"]
-    assert whole[0]["steps"] == whole[1]["steps"]
-    assert whole[0]["next_frame"]["model"] != whole[1]["next_frame"]["model"]
-    assert whole[0]["next_frame"]["constant velocity"] == whole[1]["next_frame"]["constant velocity"]
+def test_the_clock_of_a_cpu_is_its_processor_time_and_starts_anew_where_a_run_was_resumed(tmp_path, monkeypatch):
+    ticks = [(9.0, 1.0), (20.0, 3.0), (21.0, 0.5), (30.0, 2.5)]
+    lines = [json.dumps({"step": k, "seconds": a, "processor_seconds": b}) for k, (a, b) in enumerate(ticks)]
+    (tmp_path / "unet.jsonl").write_text("\n".join(lines))
+    monkeypatch.setattr(dynamics.os, "cpu_count", lambda: 2)
+    np.testing.assert_allclose(dynamics.intervals(tmp_path / "unet.jsonl"), [1.0, 1.0])
+
+
+def test_the_steps_of_all_seeds_are_what_fits_into_the_seconds_and_measured_once(tmp_path, monkeypatch):
+    """A step of 10 ms for the autoencoder and 40 ms for the UNet; every UNet takes the same number."""
+    trained = []
+    monkeypatch.setattr(dynamics, "train_dynamics", lambda *args: trained.append(args))
+    monkeypatch.setattr(
+        dynamics, "intervals", lambda path: np.array([9.0] + 5 * [0.01 if "vae" in path.name else 0.04])
+    )
+    args = dynamics.Args(seconds=100.0)
+    for name in ("unet", "unet-turned"):
+        config = dynamics.variant(configs.preset("ci"), name)
+        timed = dynamics.timed_config(args, config, typing.cast(typing.Any, None), tmp_path, "data")
+        assert (timed.vae_stage.steps, timed.unet_stage.steps) == (4000, 1500)
+        assert timed.rotate == config.rotate
+    assert len(trained) == 1
+
+
+def test_next_frames_are_pooled_over_seeds_and_turns_are_told_apart():
+    part = {"turning": [0, 0, 1, 1], "sequence": [0, 1, 0, 1]}
+    runs = [{"next_frame": part | {"model": [1.0, 1, 5, 5]}}, {"next_frame": part | {"model": [3.0, 3, 7, 7]}}]
+    assert dynamics.next_frame(runs, "model", False) == "4.0 [4.0, 4.0] (3.0 to 5.0)"
+    assert dynamics.next_frame(runs, "model", True) == "6.0 [6.0, 6.0] (5.0 to 7.0)"
+    assert dynamics.next_frame(runs, "autoencoder", False) == "none"
 
 
 def test_the_papers_recipe_has_nothing_of_ours():
