@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +21,6 @@ from avatarjax.data.sequences import Recording
 from avatarjax.metrics import drift, foot_slide, joints, motion, responsiveness
 from avatarjax.metrics.statistics import Estimate, bootstrap
 from avatarjax.unica import fit, forecast
-
-if typing.TYPE_CHECKING:
-    from experiments.unica import Experiment
 
 LONG = 2000  # frames of a rollout, as UNICA Fig. 6
 HOLD = 60  # frames a key is held in it, as UNICA C.4
@@ -128,19 +126,17 @@ def slides(data: Dataset, rolled: Long) -> dict[str, typing.Any]:
 
 
 def joint_motion(
-    experiment: Experiment, data: Dataset, built: dict[str, unica.Avatar], rolled: Long
-) -> dict[str, typing.Any] | None:
+    name: str, folder: Path, seed: int, data: Dataset, built: dict[str, unica.Avatar], rolled: Long
+) -> dict[str, typing.Any]:
     """Motion errors of forecasts of the held-out sequences, and the share of frames that spike in the long rollout.
 
     Joints of generated geometry are regressed from its surface; the truth is the skeleton that drove the recording, in
     its held-out sequences' first FORECAST frames, of which three are given. "surface of the truth" is the error of the
-    regressor alone, "no acceleration" that of going on as before. None where the data have no skeleton.
+    regressor alone, "no acceleration" that of going on as before. `folder` has the data of the avatar of that name.
     """
-    if experiment.meshes is not None:
-        return None
-    rig = avatars.build(experiment.args.avatar).rig
+    rig = avatars.build(name).rig
     chosen = [k for k, name in enumerate(rig.names) if "Hand" not in name or name.endswith("Hand")]
-    folder, held = experiment.folder / "data", data.held_out
+    held = data.held_out
     train = _joints(folder, "train", rig, chosen, np.unique(data.train.sequence))
     true = _joints(folder, "held_out", rig, chosen, np.unique(held.sequence))
     every = max(1, len(train) // _FITTED)
@@ -157,11 +153,11 @@ def joint_motion(
         rows = first[:, None] + np.arange(FORECAST)
         truth = (true + held.roots[:, None])[rows]
         predicted = {"surface of the truth": (surface + held.roots[:, None])[rows], "no acceleration": 0 * truth}
-        for name, avatar in built.items():
-            texels, roots = forecast.forecast(avatar, held, first, FORECAST - 3, jax.random.key(experiment.args.seed))
+        for model, avatar in built.items():
+            texels, roots = forecast.forecast(avatar, held, first, FORECAST - 3, jax.random.key(seed))
             ahead = np.asarray(joints.regress(regressor, texels)) + roots[:, :, None]
-            predicted[name] = np.concatenate([predicted["surface of the truth"][:, :3], ahead], axis=1)
-        result["motion_error_mm"] = {name: _errors(x, truth) for name, x in predicted.items()}
+            predicted[model] = np.concatenate([predicted["surface of the truth"][:, :3], ahead], axis=1)
+        result["motion_error_mm"] = {model: _errors(x, truth) for model, x in predicted.items()}
     calm = [motion.accelerations(x) for x in _split(surface + held.roots[:, None], held.sequence)]
     threshold = motion.spike_threshold(np.concatenate(calm))
     result["spikes"] = {"threshold_mm": 1000 * threshold, "controller": _share(calm, threshold)}
@@ -191,7 +187,7 @@ def _share(accelerations: list[np.ndarray], threshold: float) -> Estimate:
     return bootstrap(np.concatenate(marks), np.repeat(np.arange(len(marks)), [len(m) for m in marks]))
 
 
-def _joints(folder: typing.Any, split: str, rig: typing.Any, chosen: list[int], clips: np.ndarray) -> np.ndarray:
+def _joints(folder: Path, split: str, rig: typing.Any, chosen: list[int], clips: np.ndarray) -> np.ndarray:
     """True joints (f, j, 3) of a split relative to their roots, metres."""
     parts = []
     for k in clips:

@@ -56,6 +56,7 @@ def write(
 
     rolled = unica_motion.roll_long(avatar, data, seed)
     nearest = _nearest(avatar, data, frames)
+    measured_on = experiment.args.avatar, folder / "data"
     measured: dict[str, typing.Any] = {
         "responses": answers,
         "stages": _stages(experiment, data, built, dressed, plain),
@@ -63,7 +64,8 @@ def write(
         "drift_mm": {n: bootstrap(x) for n, x in nearest.items()},
         "long_rollout": {"frames": len(rolled.actions), "of": unica_motion.LONG},
         "foot_slide_mm": unica_motion.slides(data, rolled),
-        "joints": unica_motion.joint_motion(experiment, data, built, rolled),
+        # Recorded meshes come without a skeleton.
+        "joints": None if experiment.meshes else unica_motion.joint_motion(*measured_on, seed, data, built, rolled),
         "images": unica_images.measure(experiment, data, dressed, plain, frames),
         "seconds": experiment.seconds,
     }

@@ -3,6 +3,7 @@
     python -m experiments.tables quality                       # Tables 2 and C: all trained avatars
     python -m experiments.tables steps --avatars cowgirl       # Table B
     python -m experiments.tables alignment --preset ci         # Table 3: needs a run with the UNet
+    python -m experiments.tables context --preset ci           # Fig. 8: trains a model for each number of frames
     python -m experiments.tables times                         # Table D
     python -m experiments.tables sliding                       # Fig. 6: 2,000 frames, minutes an avatar
     python -m experiments.tables components novelty trail strips   # Figs. B, C (f), 5, I to L
@@ -27,11 +28,13 @@ from avatarjax.data import avatars as known
 from avatarjax.io import atomic
 from avatarjax.metrics import environment
 from avatarjax.unica.config import DynamicsName, PresetName
-from experiments.tables import figures, images, long, quality
+from experiments.tables import context, figures, images, long, quality
 from experiments.tables.finished import Finished
 from experiments.tables.table import Notebook, Table
 
-Name = typing.Literal["quality", "alignment", "steps", "times", "sliding", "components", "novelty", "trail", "strips"]
+Name = typing.Literal[
+    "quality", "alignment", "steps", "context", "times", "sliding", "components", "novelty", "trail", "strips"
+]
 
 
 @dataclasses.dataclass
@@ -45,7 +48,7 @@ class Args:
     avatars: tuple[str, ...] = ()
     """Of the runs; default: all that are finished."""
     dynamics: DynamicsName = "coefficients"
-    """The model whose sampling steps `steps` varies."""
+    """The model whose sampling steps and context `steps` and `context` vary."""
     rollouts: int = 3
     """Rollouts behind each FVD of `quality`, `alignment` and `steps`."""
     out: Path = Path("runs")
@@ -62,6 +65,7 @@ def run_tables(args: Args) -> list[Table]:
         "quality": lambda: quality.quality(runs, notebook, args.rollouts, folder),
         "alignment": lambda: images.alignment(runs, notebook, args.rollouts),
         "steps": lambda: images.steps(runs, notebook, args.rollouts, args.dynamics),
+        "context": lambda: context.context(runs, notebook, folder, args.dynamics),
         "times": lambda: long.times(runs, notebook),
         "sliding": lambda: long.sliding(runs, notebook, folder),
         "components": lambda: figures.components(runs, notebook, folder),
