@@ -252,7 +252,7 @@ def table(args: Args, results: Results, controller: dict[str, typing.Any]) -> st
     ]
     head = ["", *results, "constant velocity, or controller"]
     note = (
-        f"{args.avatar}, {args.preset}, {args.scripts}, {args.seconds:g} s of training; seeds: {args.seeds}. Means over "
+        f"{args.avatar}, {args.preset}, {args.scripts}, {args.seconds:g} s each; seeds: {args.seeds}. Means over "
         "seeds (their range); next frames: mean of the seeds with a 95 % interval from a bootstrap over the held-out "
         "sequences (range of the seeds). Diversity of the last frame, controller: the distance of two arbitrary "
         "held-out poses.\n\n"
