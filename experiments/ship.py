@@ -50,7 +50,7 @@ def ship(run: Path, /, seed: int = 0) -> Path:
         "command": f"python -m experiments.unica --avatar {name} --train --preset {run.name} --seed {seed}",
         "seconds": measured["seconds"],
         "environment": environment.describe(),
-        "metrics": {key: measured[key] for key in ("images", "turning", "stages")},
+        "metrics": {key: measured[key] for key in ("images", "turning", "stages", "foot_slide_mm")},
     }
     files.save(path, avatar, half=True, made=made)
     before, after = headings(avatar), headings(unica.load(path))

@@ -44,6 +44,21 @@ def appearance_quality(
     avatar: Avatar, images: Images, perceptual: lpips.Network | None = None, *, refined: bool = True
 ) -> Quality:
     """Of pictured poses (p) in k views each, with the appearance network or with base attributes alone."""
+    drawn = _pose_renderer(avatar, images, refined)
+    poses = zip(images.texels, images.view, images.rgba, strict=True)
+    return _judge(((drawn(x, v), truth) for x, v, truth in poses), perceptual, len(images.texels))
+
+
+def beside_truth(avatar: Avatar, images: Images, pose: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Two views of a pictured pose, each render with the picture of the mesh on its right."""
+    drawn = _pose_renderer(avatar, images, True)(images.texels[pose], images.view[pose, :2])
+    pairs = zip(drawn, photometric.over(images.rgba[pose, :2], 0.0), strict=True)
+    strip = jnp.concatenate([x for pair in pairs for x in pair], axis=1)
+    return np.asarray(jnp.round(255 * strip), np.uint8)
+
+
+def _pose_renderer(avatar: Avatar, images: Images, refined: bool):
+    """A function from texels (t, 3) of a pose and ids of views (k,) to renders (k, h, w, 3) over black."""
     cameras = cylinder_cameras(images.rgba.shape[-2])
     splat = _splat_config(avatar, images.texels[0], cameras)
 
@@ -53,12 +68,7 @@ def appearance_quality(
         box = posmap.bounding_box(posmap.upscale(avatar.upscaler, texels))
         return _draw(in_box(cloud, box), views, splat)
 
-    poses = zip(images.texels, images.view, images.rgba, strict=True)
-    return _judge(
-        ((drawn(avatar, jnp.asarray(x), photometric.pick_views(cameras, v)), truth) for x, v, truth in poses),
-        perceptual,
-        len(images.texels),
-    )
+    return lambda texels, views: drawn(avatar, jnp.asarray(texels), photometric.pick_views(cameras, views))
 
 
 def untrained_base(avatar: Avatar, images: Images) -> Avatar:
