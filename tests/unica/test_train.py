@@ -53,7 +53,7 @@ class TestUnet:
         return self.handed_over(few, tiny_data, run, latent_dynamics, monkeypatch)
 
     def test_the_first_stage_comes_first_and_learns_the_embeddings(self, stage):
-        assert [bool(stage["batch_at"](k)["learn_actions"]) for k in range(6)] == [True] * 3 + [False] * 3
+        assert [bool(stage["batch_at"](k)["steady"]) for k in range(6)] == [True] * 3 + [False] * 3
 
     def test_embeddings_are_frozen_in_the_second_stage_and_nothing_else_is(self, stage):
         old = stage["initial"]

@@ -14,6 +14,7 @@ from avatarjax.nets.functional import Params
 from avatarjax.posmap import Atlas, Box, Tangents, Upscaler
 from avatarjax.posmap import pca as pcs
 from avatarjax.unica import align, appearance, texel_head
+from avatarjax.unica.baselines.feed_forward import FeedForwardDynamics
 from avatarjax.unica.coefficients import CoefficientDynamics
 from avatarjax.unica.config import UnicaConfig
 from avatarjax.unica.latent import LatentDynamics
@@ -26,8 +27,9 @@ class Avatar:
 
     `standing` (t, 3) are the texels of the standing pose in metres with the root above the world's origin. `dynamics`
     is either of the two models and `appearance` the parameters of either of the two networks; `config`, static, says
-    which. `pca` is the basis of normalised fourth maps that aligns the six views of the UNet's maps; maps of the
-    coefficient model are aligned as they come, and it is None.
+    which; `dynamics` may also be the baseline that takes the UNet's place. `pca` is the basis of normalised fourth maps
+    that aligns the six views of the UNet's maps; maps of the coefficient model are aligned as they come, and it is
+    None.
     """
 
     atlas: Atlas
@@ -36,7 +38,7 @@ class Avatar:
     pca: pcs.PCA | None
     base: appearance.BaseAttributes
     appearance: Params
-    dynamics: CoefficientDynamics | LatentDynamics
+    dynamics: CoefficientDynamics | LatentDynamics | FeedForwardDynamics
     standing: Float[Array, "t 3"]
     config: UnicaConfig = flax.struct.field(pytree_node=False)
 

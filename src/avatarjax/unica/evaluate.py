@@ -15,6 +15,9 @@ from avatarjax.posmap import pca as pcs
 from avatarjax.unica import batches, coefficients, latent
 from avatarjax.unica import train as training
 from avatarjax.unica.avatar import Avatar
+from avatarjax.unica.baselines import feed_forward
+from avatarjax.unica.baselines.feed_forward import FeedForwardDynamics
+from avatarjax.unica.rollout import next_maps
 
 CHUNK = 64
 
@@ -43,11 +46,11 @@ def one_step(avatar: Avatar, data: Dataset, chosen: Int[np.ndarray, "g"], key: j
     windows = batches.windows(data.held_out, 4, config.turn_window)
     scale = float(data.atlas.scale)
     groups, actions = windows.groups(chosen, scale)
-    if isinstance(avatar.dynamics, latent.LatentDynamics):
-        step = jax.jit(lambda avatar, g, a: latent.sample(config.latent, avatar.atlas, avatar.dynamics, key, g, a))
-        predicted = _in_chunks(functools.partial(step, avatar), groups[:, :3], actions)
-    else:
+    if isinstance(avatar.dynamics, coefficients.CoefficientDynamics):
         predicted = _coefficient_step(avatar, data, windows.frames(chosen), actions, key)
+    else:
+        step = jax.jit(lambda avatar, g, a: next_maps(avatar, key, g, a))
+        predicted = _in_chunks(functools.partial(step, avatar), groups[:, :3], actions)
     truth = groups[:, 3]
     return {
         "model": millimetres(predicted, truth, scale),
@@ -83,6 +86,8 @@ def reconstruction(avatar: Avatar, data: Dataset, chosen: Int[np.ndarray, "g"]) 
 
     @jax.jit
     def around(avatar, texels):
+        if isinstance(avatar.dynamics, FeedForwardDynamics):
+            return feed_forward.reconstruct(avatar.atlas, avatar.dynamics, texels)
         latents = latent.encode(config.latent, avatar.atlas, avatar.dynamics, texels)
         return latent.decode(config.latent, avatar.atlas, avatar.dynamics, latents)
 

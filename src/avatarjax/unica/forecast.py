@@ -13,7 +13,7 @@ from avatarjax.posmap import Atlas
 from avatarjax.posmap import pca as pcs
 from avatarjax.unica import coefficients
 from avatarjax.unica.avatar import Avatar
-from avatarjax.unica.latent import LatentDynamics
+from avatarjax.unica.coefficients import CoefficientDynamics
 from avatarjax.unica.rollout import Frame, State, rollout
 
 
@@ -25,14 +25,14 @@ def state_at(
 ) -> State:
     """The state after three known frames, oldest first: root-relative texels and roots in the world, metres."""
     texels, roots = jnp.asarray(texels), jnp.asarray(roots)
-    if isinstance(avatar.dynamics, LatentDynamics):
-        context = posmap.normalize(avatar.atlas, texels + roots[:, None], roots[2])
-    else:
+    if isinstance(avatar.dynamics, CoefficientDynamics):
         flat, ground = jax.vmap(lambda x: coefficients.canonical(avatar.atlas, x))(texels + roots[:, None])
         # Headings are compared across the three frames: no jump by a full turn between them.
         ground = ground.at[:, 2].set(jnp.unwrap(ground[:, 2]))
         ground = ground.at[:, :2].add(-ground[2:, :2])
         context = coefficients.Context(pose=pcs.project(avatar.dynamics.basis, flat), root=ground)
+    else:
+        context = posmap.normalize(avatar.atlas, texels + roots[:, None], roots[2])
     return State(context, roots[2], key)
 
 

@@ -57,7 +57,18 @@ class LatentDynamics:
     latent_scale: Float[Array, "l"]
 
 
-def to_images(atlas: Atlas, dynamics: LatentDynamics, texels: Float[Array, "b t 3"]) -> Float[Array, "b h w 3"]:
+@typing.runtime_checkable
+class MapStatistics(typing.Protocol):
+    """Whatever knows the mean (t, 3) and the size () of the deviation from it of normalised texels."""
+
+    @property
+    def map_mean(self) -> Float[Array, "t 3"]: ...
+
+    @property
+    def map_scale(self) -> Float[Array, ""]: ...
+
+
+def to_images(atlas: Atlas, dynamics: MapStatistics, texels: Float[Array, "b t 3"]) -> Float[Array, "b h w 3"]:
     """Normalised texels as the autoencoder's input: their deviation from the mean map, of unit size, background 0.
 
     The deviation is ours: the mean map is the same in every frame, and a network that must also paint it, with its
@@ -67,7 +78,7 @@ def to_images(atlas: Atlas, dynamics: LatentDynamics, texels: Float[Array, "b t 
     return jax.vmap(lambda x: posmap.to_map(atlas, x))(deviation)
 
 
-def from_images(atlas: Atlas, dynamics: LatentDynamics, images: Float[Array, "b h w 3"]) -> Float[Array, "b t 3"]:
+def from_images(atlas: Atlas, dynamics: MapStatistics, images: Float[Array, "b h w 3"]) -> Float[Array, "b t 3"]:
     """The inverse of `to_images` on the foreground."""
     deviation = jax.vmap(lambda x: posmap.from_map(atlas, x))(images)
     return deviation * dynamics.map_scale + dynamics.map_mean[None]

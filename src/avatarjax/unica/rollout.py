@@ -19,7 +19,9 @@ from avatarjax.gaussians import Gaussians
 from avatarjax.posmap import pca as pcs
 from avatarjax.unica import coefficients, latent
 from avatarjax.unica.avatar import Avatar, overflow, wear
-from avatarjax.unica.latent import LatentDynamics
+from avatarjax.unica.baselines import feed_forward
+from avatarjax.unica.baselines.feed_forward import FeedForwardDynamics
+from avatarjax.unica.coefficients import CoefficientDynamics
 
 
 @typing.no_type_check
@@ -28,7 +30,7 @@ class State:
     """Where a rollout is: the context of the dynamics model, the world position (3,) of the root in metres, a PRNG key.
 
     The context holds the last three frames with the root of the newest at the origin: normalised texels (3, t, 3) for
-    the UNet, `coefficients.Context` for the coefficient model.
+    the UNet and its baseline, `coefficients.Context` for the coefficient model.
     """
 
     context: typing.Any
@@ -64,10 +66,7 @@ class Frame:
 
 def reset(avatar: Avatar, key: Key[Array, ""]) -> State:
     """The state before the first key: standing at the world's origin, the standing map three times (UNICA C.4)."""
-    if isinstance(avatar.dynamics, LatentDynamics):
-        texels = posmap.normalize(avatar.atlas, avatar.standing, posmap.root(avatar.atlas, avatar.standing))
-        context = jnp.repeat(texels[None], latent.CONTEXT, axis=0)
-    else:
+    if isinstance(avatar.dynamics, CoefficientDynamics):
         flat, root = coefficients.canonical(avatar.atlas, avatar.standing)
         pose = pcs.project(avatar.dynamics.basis, flat)
         root = root.at[:2].set(0.0)
@@ -75,6 +74,9 @@ def reset(avatar: Avatar, key: Key[Array, ""]) -> State:
             pose=jnp.repeat(pose[None], coefficients.CONTEXT, axis=0),
             root=jnp.repeat(root[None], coefficients.CONTEXT, axis=0),
         )
+    else:
+        texels = posmap.normalize(avatar.atlas, avatar.standing, posmap.root(avatar.atlas, avatar.standing))
+        context = jnp.repeat(texels[None], latent.CONTEXT, axis=0)
     return State(context, posmap.root(avatar.atlas, avatar.standing), key)
 
 
@@ -116,7 +118,7 @@ def _aligned(avatar: Avatar, texels: Float[Array, "t 3"]) -> Float[Array, "t 3"]
 
 def _step(avatar: Avatar, state: State, action: Int[Array, ""], gaussians: bool) -> tuple[State, Frame]:
     key, sample_key = jax.random.split(state.key)
-    advance = _advance_latent if isinstance(avatar.dynamics, LatentDynamics) else _advance_coefficients
+    advance = _advance_coefficients if isinstance(avatar.dynamics, CoefficientDynamics) else _advance_maps
     context, texels = advance(avatar, state, sample_key, action)
 
     # Movement accumulation (Eq. 7): in the shared space of the group, the root has moved from 0.5 to here.
@@ -134,10 +136,18 @@ def _step(avatar: Avatar, state: State, action: Int[Array, ""], gaussians: bool)
     return State(context, root, key), frame
 
 
-def _advance_latent(avatar: Avatar, state: State, key, action):
+def next_maps(
+    avatar: Avatar, key: Key[Array, ""], context: Float[Array, "b 3 t 3"], action: Int[Array, "b"]
+) -> Float[Array, "b t 3"]:
+    """The next normalised texels from three normalised frames, by the UNet or by the baseline in its place."""
+    if isinstance(avatar.dynamics, FeedForwardDynamics):
+        return feed_forward.predict(avatar.atlas, avatar.dynamics, context, action)
+    return latent.sample(avatar.config.latent, avatar.atlas, avatar.dynamics, key, context, action)
+
+
+def _advance_maps(avatar: Avatar, state: State, key, action):
     """The next normalised texels, and the context renormalised about them (Eq. 8)."""
-    settings, context = avatar.config.latent, state.context[None]
-    texels = latent.sample(settings, avatar.atlas, avatar.dynamics, key, context, action[None])[0]
+    texels = next_maps(avatar, key, state.context[None], action[None])[0]
     context = jnp.concatenate([state.context[1:], texels[None]])
     return context - (posmap.root(avatar.atlas, texels) - 0.5)[None, None], texels
 

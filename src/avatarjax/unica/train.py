@@ -68,14 +68,13 @@ def train_stage(
 
 def new_latent_dynamics(config: UnicaConfig, data: Dataset, run: Run) -> LatentDynamics:
     """Untrained autoencoder and UNet, with the statistics of the maps."""
-    groups = _sample_groups(config, data, 256)
-    mean = groups.mean((0, 1))
+    mean, scale = map_statistics(config, data)
     width = config.latent.vae.latent_channels
     return LatentDynamics(
         vae=functional.init(VAE, config.latent.vae, run.key("vae")),
         denoiser=functional.init(Denoiser, config.latent.denoiser, run.key("unet")),
-        map_mean=jnp.asarray(mean),
-        map_scale=jnp.asarray((groups - mean).std()),
+        map_mean=mean,
+        map_scale=scale,
         latent_mean=jnp.zeros(width),
         latent_scale=jnp.ones(width),
     )
@@ -103,33 +102,68 @@ def _training_groups(config: UnicaConfig, data: Dataset) -> tuple[Windows, MakeG
     return windows, turned
 
 
-def _sample_groups(config: UnicaConfig, data: Dataset, count: int) -> np.ndarray:
+def sample_groups(config: UnicaConfig, data: Dataset, count: int) -> np.ndarray:
     """Evenly spaced training groups (count, 4, t, 3) in normalised space."""
     windows, make = _training_groups(config, data)
     chosen = np.linspace(0, len(windows.first) - 1, min(count, len(windows.first))).astype(int)
     return make(chosen, np.random.default_rng(0))[0]
 
 
-def train_vae(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamics) -> LatentDynamics:
-    """The autoencoder, on the frames of random groups: each frame at the four places it takes in them.
+def map_statistics(config: UnicaConfig, data: Dataset) -> tuple[jax.Array, jax.Array]:
+    """Mean (t, 3) and size () of the deviation from it, of normalised training maps."""
+    groups = sample_groups(config, data, 256)
+    mean = groups.mean((0, 1))
+    return jnp.asarray(mean), jnp.asarray((groups - mean).std())
 
-    Returns the dynamics with the trained autoencoder and the statistics of its latents.
-    """
+
+def frame_batches(config: UnicaConfig, data: Dataset, seed: int) -> Callable[[int], np.ndarray]:
+    """What an autoencoder sees at each step: normalised texels (b, t, 3) of frames of random groups, each frame at the
+    four places it takes in them."""
     windows, make = _training_groups(config, data)
-    stage, settings = config.vae_stage, (config.latent, config.rotate)
+    count = config.vae_stage.batch
 
     def batch_at(step):
-        rng = batches.generator(run.seed, step)
-        groups, _ = make(rng.integers(0, len(windows.first), stage.batch), rng)
-        texels = groups[np.arange(stage.batch), rng.integers(0, 4, stage.batch)]
-        return {"atlas": data.atlas, "frozen": start.replace(vae={}, denoiser={}), "texels": texels}
+        rng = batches.generator(seed, step)
+        groups, _ = make(rng.integers(0, len(windows.first), count), rng)
+        return groups[np.arange(count), rng.integers(0, 4, count)]
+
+    return batch_at
+
+
+def group_batches(config: UnicaConfig, data: Dataset, seed: int) -> Callable[[int], dict[str, typing.Any]]:
+    """What a model of the fourth frame sees at each step: "groups" (b, 4, t, 3), their "actions" (b,), and whether the
+    step is "steady", of the first stage (UNICA 3.6).
+
+    The first stage sees steady movement only; the second draws 70 % of its groups from the frames after a turn.
+    """
+    windows, make = _training_groups(config, data)
+    stage = config.unet_stage
+    everything = np.ones_like(windows.turning)
+
+    def batch_at(step):
+        rng = batches.generator(seed, step)
+        steady = step < config.unet_steady * stage.steps
+        allowed, fraction = (~windows.turning, 0.0) if steady else (everything, config.turn_fraction)
+        groups, actions = make(batches.draw(allowed, windows.turning, fraction, stage.batch, rng), rng)
+        return {"groups": groups, "actions": actions, "steady": np.bool_(steady)}
+
+    return batch_at
+
+
+def train_vae(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamics) -> LatentDynamics:
+    """The autoencoder, with the statistics of its latents."""
+    stage, settings = config.vae_stage, (config.latent, config.rotate)
+    frames_at = frame_batches(config, data, run.seed)
+
+    def batch_at(step):
+        return {"atlas": data.atlas, "frozen": start.replace(vae={}, denoiser={}), "texels": frames_at(step)}
 
     def loss(params, key, batch):
         dynamics = batch["frozen"].replace(vae=params)
         return latent.vae_loss(config.latent, batch["atlas"], dynamics, key, batch["texels"])
 
     trained = start.replace(vae=train_stage(run, "vae", stage, settings, loss, start.vae, batch_at))
-    groups = _sample_groups(config, data, 64)
+    groups = sample_groups(config, data, 64)
     encode = jax.jit(functools.partial(latent.encode, config.latent))
     mean, spread = closed_form.latent_statistics(encode(data.atlas, trained, groups.reshape(-1, *groups.shape[2:])))
     return trained.replace(latent_mean=mean, latent_scale=spread)
@@ -138,37 +172,26 @@ def train_vae(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamic
 def train_unet(config: UnicaConfig, data: Dataset, run: Run, start: LatentDynamics) -> LatentDynamics:
     """Diffusion training in the two stages of UNICA 3.6, as one run of steps.
 
-    The first stage learns action embeddings and UNet on steady movement only. The second freezes the embeddings and
-    draws 70 % of its groups from the frames after a turning point.
+    The first stage learns action embeddings and UNet; the second, on other groups (`group_batches`), freezes the
+    embeddings.
     """
-    windows, make = _training_groups(config, data)
     stage = config.unet_stage
-    everything = np.ones_like(windows.turning)
+    groups_at = group_batches(config, data, run.seed)
     turns = (config.turn_window, config.turn_fraction, config.rotate)
     settings = (config.latent, config.vae_stage, config.unet_steady, *turns)
 
     def batch_at(step):
-        rng = batches.generator(run.seed, step)
-        steady = step < config.unet_steady * stage.steps
-        allowed, fraction = (~windows.turning, 0.0) if steady else (everything, config.turn_fraction)
-        groups, actions = make(batches.draw(allowed, windows.turning, fraction, stage.batch, rng), rng)
-        return {
-            "atlas": data.atlas,
-            "frozen": start.replace(denoiser={}),
-            "groups": groups,
-            "actions": actions,
-            "learn_actions": np.bool_(steady),
-        }
+        return {"atlas": data.atlas, "frozen": start.replace(denoiser={}), **groups_at(step)}
 
     def loss(params, key, batch):
         table = params["action_table"]["embedding"]
-        table = jnp.where(batch["learn_actions"], table, jax.lax.stop_gradient(table))
+        table = jnp.where(batch["steady"], table, jax.lax.stop_gradient(table))
         dynamics = batch["frozen"].replace(denoiser={**params, "action_table": {"embedding": table}})
         groups, actions = batch["groups"], batch["actions"]
         return latent.diffusion_loss(config.latent, batch["atlas"], dynamics, key, groups, actions), {}
 
     def hold(new, old, batch):
-        table = jnp.where(batch["learn_actions"], new["action_table"]["embedding"], old["action_table"]["embedding"])
+        table = jnp.where(batch["steady"], new["action_table"]["embedding"], old["action_table"]["embedding"])
         return {**new, "action_table": {"embedding": table}}
 
     return start.replace(denoiser=train_stage(run, "unet", stage, settings, loss, start.denoiser, batch_at, hold))
