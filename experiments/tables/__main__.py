@@ -4,6 +4,8 @@
     python -m experiments.tables steps --avatars cowgirl       # Table B
     python -m experiments.tables alignment --preset ci         # Table 3: needs a run with the UNet
     python -m experiments.tables context --preset ci           # Fig. 8: trains a model for each number of frames
+    python -m experiments.tables feed_forward --preset ci      # Fig. D: trains it for as many steps as the run's UNet
+    python -m experiments.tables resolution --preset ci        # Fig. E: trains appearance for four pairs of sides
     python -m experiments.tables times                         # Table D
     python -m experiments.tables sliding                       # Fig. 6: 2,000 frames, minutes an avatar
     python -m experiments.tables components novelty trail strips   # Figs. B, C (f), 5, I to L
@@ -28,12 +30,23 @@ from avatarjax.data import avatars as known
 from avatarjax.io import atomic
 from avatarjax.metrics import environment
 from avatarjax.unica.config import DynamicsName, PresetName
-from experiments.tables import context, figures, images, long, quality
+from experiments.tables import context, feed_forward, figures, images, long, quality, resolution
 from experiments.tables.finished import Finished
 from experiments.tables.table import Notebook, Table
 
 Name = typing.Literal[
-    "quality", "alignment", "steps", "context", "times", "sliding", "components", "novelty", "trail", "strips"
+    "quality",
+    "alignment",
+    "steps",
+    "context",
+    "feed_forward",
+    "resolution",
+    "times",
+    "sliding",
+    "components",
+    "novelty",
+    "trail",
+    "strips",
 ]
 
 
@@ -66,6 +79,8 @@ def run_tables(args: Args) -> list[Table]:
         "alignment": lambda: images.alignment(runs, notebook, args.rollouts),
         "steps": lambda: images.steps(runs, notebook, args.rollouts, args.dynamics),
         "context": lambda: context.context(runs, notebook, folder, args.dynamics),
+        "feed_forward": lambda: feed_forward.feed_forward(runs, notebook, folder),
+        "resolution": lambda: resolution.resolution(runs, notebook, folder),
         "times": lambda: long.times(runs, notebook),
         "sliding": lambda: long.sliding(runs, notebook, folder),
         "components": lambda: figures.components(runs, notebook, folder),
