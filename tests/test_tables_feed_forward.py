@@ -35,11 +35,17 @@ def test_geometry_is_worse_only_beyond_the_intervals(ours, unet, verdict):
 
 
 @pytest.mark.parametrize(
-    "ours, unet, verdict",
-    [(0.1, 0.9, ": reproduced."), (0.1, 0.1, "true of both"), (0.8, 0.9, "not reproduced."), (np.nan, 0.9, "not repr")],
+    "ours, path, unet, verdict",
+    [
+        (0.1, 0.1, 0.9, ": reproduced."),
+        (0.1, 0.8, 0.9, "it wanders"),
+        (0.1, 0.1, 0.1, "true of both"),
+        (0.8, 0.9, 0.9, "not reproduced."),
+        (np.nan, np.nan, 0.9, "not reproduced."),
+    ],
 )
-def test_stationary_counts_where_diffusion_is_not(ours, unet, verdict):
-    assert verdict in feed_forward.driving_finding(ours, unet)
+def test_standing_counts_where_diffusion_drives(ours, path, unet, verdict):
+    assert verdict in feed_forward.driving_finding(ours, path, unet)
 
 
 def test_clouds_are_drawn(tmp_path):
