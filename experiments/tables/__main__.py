@@ -1,5 +1,6 @@
 """Print UNICA's tables and figures as measured on finished runs, beside the paper's numbers.
 
+    python -m experiments.tables summary                       # what the reports of all trained avatars say
     python -m experiments.tables quality                       # Tables 2 and C: all trained avatars
     python -m experiments.tables steps --avatars cowgirl       # Table B
     python -m experiments.tables alignment --preset ci         # Table 3: needs a run with the UNet
@@ -30,11 +31,12 @@ from avatarjax.data import avatars as known
 from avatarjax.io import atomic
 from avatarjax.metrics import environment
 from avatarjax.unica.config import DynamicsName, PresetName
-from experiments.tables import context, feed_forward, figures, images, long, quality, resolution
+from experiments.tables import context, feed_forward, figures, images, long, quality, resolution, summary
 from experiments.tables.finished import Finished
 from experiments.tables.table import Notebook, Table
 
 Name = typing.Literal[
+    "summary",
     "quality",
     "alignment",
     "steps",
@@ -75,6 +77,7 @@ def run_tables(args: Args) -> list[Table]:
     folder.mkdir(parents=True, exist_ok=True)
     notebook = Notebook(folder / "cells.json")
     makers: dict[str, Callable[[], Table]] = {
+        "summary": lambda: summary.summary(runs),
         "quality": lambda: quality.quality(runs, notebook, args.rollouts, folder),
         "alignment": lambda: images.alignment(runs, notebook, args.rollouts),
         "steps": lambda: images.steps(runs, notebook, args.rollouts, args.dynamics),
