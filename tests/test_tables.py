@@ -63,5 +63,5 @@ def test_help_names_every_table(capsys):
         tables.main(["--help"])
     assert stopped.value.code == 0
     shown = " ".join(capsys.readouterr().out.split())
-    names = "quality alignment steps context feed_forward resolution times sliding components novelty trail strips"
+    names = "summary quality alignment steps context feed_forward resolution times sliding components novelty trail strips"
     assert all(name in shown for name in names.split())
