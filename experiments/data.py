@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 import time
 import typing
 from collections.abc import Callable
@@ -22,7 +21,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import tyro
 from tqdm import tqdm
 
 from avatarjax import cameras
@@ -37,6 +35,7 @@ from avatarjax.metrics import foot_slide, published, responsiveness
 from avatarjax.metrics.report import Report
 from avatarjax.metrics.statistics import Estimate, bootstrap
 from avatarjax.physics.xpbd import XPBDConfig
+from experiments import command_line
 
 SCRIPT = (1,) * 30 + (2,) * 30 + (3,) * 30 + (0,) * 30
 # Preset: side of the position maps, upscaled, frames of a transition and of a held-out one, poses, views, pixels,
@@ -340,21 +339,15 @@ def write_report(
     report.write(folder / "report.html")
 
 
+def make_all(args: Args) -> None:
+    """The dataset of the avatar that is asked for, or of each."""
+    for name in avatars.names() if args.avatar == "all" else (args.avatar,):
+        make(args, name)
+
+
 def main(argv: list[str] | None = None) -> int:
-    """Command line; errors a user can mend are printed, not traced."""
-    args = tyro.cli(Args, prog="python -m experiments.data", args=argv, description=__doc__)
-    jax.config.update("jax_compilation_cache_dir", str(args.out.absolute() / ".jax_cache"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-    try:
-        for name in avatars.names() if args.avatar == "all" else (args.avatar,):
-            make(args, name)
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("\ninterrupted: run the same command to go on", file=sys.stderr)
-        return 130
-    return 0
+    """Command line; returns the exit status."""
+    return command_line.run(make_all, Args, "experiments.data", __doc__, argv)
 
 
 if __name__ == "__main__":

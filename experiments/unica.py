@@ -15,14 +15,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-import sys
 import time
 import typing
 from collections.abc import Callable
 from pathlib import Path
 
 import jax
-import tyro
 
 from avatarjax import posmap, unica
 from avatarjax.data import MeshSequence, avatars, building, dataset, load_mesh_sequence
@@ -31,7 +29,7 @@ from avatarjax.metrics import lpips, pretrained
 from avatarjax.train import read_metrics
 from avatarjax.unica import files, train, train_appearance
 from avatarjax.unica.config import AppearanceName, DynamicsName, UnicaConfig
-from experiments import pictures, unica_report, unica_shipped
+from experiments import command_line, pictures, unica_report, unica_shipped
 from experiments.unica_rollout import SCRIPT, roll_and_draw
 
 STAGES = ("data", "vae", "unet", "coefficients", "pca", "base", "appearance", "texels", "rollout", "report")
@@ -280,19 +278,8 @@ def assemble(
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Command line; errors a user can mend are printed, not traced."""
-    args = tyro.cli(Args, prog="python -m experiments.unica", args=argv, description=__doc__)
-    jax.config.update("jax_compilation_cache_dir", str(args.out.absolute() / ".jax_cache"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-    try:
-        run_experiment(args)
-    except (ValueError, FloatingPointError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("\ninterrupted: run the same command to go on", file=sys.stderr)
-        return 130
-    return 0
+    """Command line; returns the exit status."""
+    return command_line.run(run_experiment, Args, "experiments.unica", __doc__, argv)
 
 
 if __name__ == "__main__":

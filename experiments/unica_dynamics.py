@@ -17,14 +17,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import sys
 import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
-import tyro
 
 from avatarjax import unica
 from avatarjax.data import avatars, building, dataset
@@ -34,7 +32,7 @@ from avatarjax.metrics.statistics import bootstrap
 from avatarjax.train import read_metrics
 from avatarjax.unica import train
 from avatarjax.unica.config import UnicaConfig
-from experiments import pictures
+from experiments import command_line, pictures
 from experiments import unica as main_run
 from experiments import unica_dynamics_measures as measures
 
@@ -302,19 +300,8 @@ def across(values: Sequence[float | None], digits: str) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Command line; errors a user can mend are printed, not traced."""
-    args = tyro.cli(Args, prog="python -m experiments.unica_dynamics", args=argv, description=__doc__)
-    jax.config.update("jax_compilation_cache_dir", str(args.out.absolute() / ".jax_cache"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-    try:
-        run(args)
-    except (ValueError, FloatingPointError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("\ninterrupted: run the same command to go on", file=sys.stderr)
-        return 130
-    return 0
+    """Command line; returns the exit status."""
+    return command_line.run(run, Args, "experiments.unica_dynamics", __doc__, argv)
 
 
 if __name__ == "__main__":

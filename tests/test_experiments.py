@@ -1,5 +1,6 @@
 """The command line of `experiments.unica`: what is refused, and how it is said. No training."""
 
+import jax
 import pytest
 
 from experiments import unica as experiment
@@ -20,7 +21,7 @@ class TestRefusal:
         assert not list(tmp_path.iterdir())
 
     def test_the_command_fails_with_one_line(self, changes, message, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr(experiment.jax.config, "update", lambda *_: None)
+        monkeypatch.setattr(jax.config, "update", lambda *_: None)
         arguments = [part for name, value in changes.items() for part in (f"--{name}", value)]
         assert experiment.main([*arguments, "--out", str(tmp_path)]) == 1
         error = capsys.readouterr().err

@@ -3,6 +3,7 @@
 import math
 import typing
 
+import jax
 import pytest
 
 from avatarjax.metrics.published import UNICA_3
@@ -53,7 +54,7 @@ def test_a_notebook_measures_once_and_keeps_estimates(tmp_path):
 
 
 def test_without_a_run_the_command_says_how_to_make_one(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(tables.jax.config, "update", lambda *_: None)
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
     assert tables.main(["steps", "--avatars", "monk", "--out", str(tmp_path)]) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: ") and "--avatar monk --train --preset small" in error

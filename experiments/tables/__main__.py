@@ -19,18 +19,17 @@ on. SV4D and the user study of the paper are not reproduced.
 from __future__ import annotations
 
 import dataclasses
-import sys
 import typing
 from collections.abc import Callable
 from pathlib import Path
 
-import jax
 import tyro
 
 from avatarjax.data import avatars as known
 from avatarjax.io import atomic
 from avatarjax.metrics import environment
 from avatarjax.unica.config import DynamicsName, PresetName
+from experiments import command_line
 from experiments.tables import context, feed_forward, figures, images, long, quality, resolution, summary
 from experiments.tables.finished import Finished
 from experiments.tables.table import Notebook, Table
@@ -116,18 +115,8 @@ def finished(args: Args) -> list[Finished]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Command line; errors a user can mend are printed, not traced."""
-    args = tyro.cli(Args, prog="python -m experiments.tables", args=argv, description=__doc__)
-    jax.config.update("jax_compilation_cache_dir", str(args.out.absolute() / ".jax_cache"))
-    try:
-        run_tables(args)
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("\ninterrupted: run the same command to go on", file=sys.stderr)
-        return 130
-    return 0
+    """Command line; returns the exit status."""
+    return command_line.run(run_tables, Args, "experiments.tables", __doc__, argv)
 
 
 if __name__ == "__main__":
