@@ -10,11 +10,10 @@ import pytest
 from avatarjax import posmap, unica
 from avatarjax.nets import functional
 from avatarjax.nets.functional import bind
-from avatarjax.train import read_metrics
-from avatarjax.unica import batches, evaluate, forecast, train
-from avatarjax.unica.baselines import feed_forward, train_feed_forward, vq
+from avatarjax.unica import batches, evaluate, forecast
+from avatarjax.unica.baselines import feed_forward, vq
 from avatarjax.unica.baselines.feed_forward import FeedForwardConfig, FeedForwardDynamics, Transformer
-from avatarjax.unica.config import StageConfig, preset
+from avatarjax.unica.config import preset
 from avatarjax.unica.denoiser import Denoiser
 from avatarjax.unica.vae import VAE, VAEConfig
 from tests.parameters import random_params
@@ -218,35 +217,3 @@ def test_it_has_as_many_parameters_as_the_unet(name):
     sizes = feed_forward.sized(config)
     count += (sizes.depth - 1) * 20 * sizes.width**2
     assert count == pytest.approx(beside, rel=0.15)
-
-
-@pytest.fixture(scope="module")
-def trained(config, tiny_data, tmp_path_factory):
-    """The folder of a training of some dozen steps, and what came of it."""
-    few = dataclasses.replace(config, vae_stage=StageConfig(24, 4, 3e-3), unet_stage=StageConfig(24, 4, 3e-3))
-    run = train.Run(tmp_path_factory.mktemp("feed_forward"), 0, "tiny")
-    start = train_feed_forward.new_dynamics(few, tiny_data, run, SIZES)
-    middle = train_feed_forward.train_vqvae(few, tiny_data, run, start)
-    return run.folder, start, train_feed_forward.train_transformer(few, tiny_data, run, middle)
-
-
-@pytest.mark.parametrize("stage", ["vqvae", "transformer"])
-def test_a_short_training_lowers_the_loss(trained, stage):
-    losses = [record["loss"] for record in read_metrics(trained[0] / f"{stage}.jsonl")]
-    assert np.mean(losses[-6:]) < 0.9 * np.mean(losses[:3])
-
-
-def test_training_moves_the_codebook_and_brings_its_codes_to_unit_size(config, trained, tiny_data):
-    _, start, found = trained
-    assert np.abs(found.codebook - start.codebook).max() > 1e-3
-    used = found.codebook[
-        jax.jit(feed_forward.codes)(tiny_data.atlas, found, groups_of(tiny_data, np.arange(64))[0][:, 3])
-    ]
-    unit = (np.asarray(used) - np.asarray(found.code_mean)) / float(found.code_scale)
-    assert 0.3 < unit.std() < 3
-    assert jax.tree.structure(found) == jax.tree.structure(start)
-
-
-def test_every_entry_starts_where_the_encoder_says_something(trained, tiny_data):
-    start = trained[1]
-    assert len(np.unique(start.codebook, axis=0)) > SIZES.codes // 2
