@@ -6,20 +6,15 @@ import dataclasses
 import typing
 from pathlib import Path
 
-import jax
-import numpy as np
-
 from avatarjax import unica
 from avatarjax.data import dataset
-from avatarjax.metrics.statistics import bootstrap
-from avatarjax.unica import batches, evaluate, train
+from avatarjax.unica import train
 from avatarjax.unica.config import DynamicsName, UnicaConfig
 from experiments import unica_motion
 from experiments.tables.finished import Finished
 from experiments.tables.table import Notebook, Table
 
 FRAMES = (1, 2, 3)
-GROUPS = 400
 
 
 def context(runs: list[Finished], notebook: Notebook, folder: Path, dynamics: DynamicsName) -> Table:
@@ -79,17 +74,11 @@ def with_context(config: UnicaConfig, count: int) -> UnicaConfig:
 
 def _measured(run: Finished, avatar: unica.Avatar) -> dict[str, typing.Any]:
     data = run.data
-    windows = batches.windows(data.held_out, 4, avatar.config.turn_window)
-    chosen = np.unique(np.linspace(0, len(windows.first) - 1, GROUPS).astype(int))
-    error = evaluate.one_step(avatar, data, chosen, jax.random.key(11))
-    sequence = np.asarray(data.held_out.sequence)[windows.first[chosen]]
     rolled = unica_motion.roll_long(avatar, data, 0)
     slides = unica_motion.slides(data, rolled).get("rollout")
     joints = unica_motion.joint_motion(run.name, run.folder / "data", 0, data, {"model": avatar}, rolled)
-    turns = error["turning"]
     return {
-        "all": bootstrap(error["model"], sequence),
-        "turning": bootstrap(error["model"][turns], sequence[turns]),
+        **run.next_frames(avatar),
         "motion": joints["motion_error_mm"]["model"]["all joints"],
         "spikes": joints["spikes"].get("rollout"),
         "heading": unica_motion.answers(data, avatar, rolled)["rollout"]["heading_error"],

@@ -13,11 +13,10 @@ from avatarjax import unica
 from avatarjax.data import dataset
 from avatarjax.data.dataset import Dataset
 from avatarjax.metrics.statistics import Estimate, bootstrap
-from avatarjax.unica import batches, evaluate, forecast
+from avatarjax.unica import evaluate, forecast
 from avatarjax.unica.baselines import train_feed_forward
 from avatarjax.unica.train import Run
 from experiments import pictures, unica_motion
-from experiments.tables.context import GROUPS
 from experiments.tables.finished import Finished
 from experiments.tables.table import Notebook, Table, cell
 
@@ -84,20 +83,12 @@ def _trained(run: Finished, avatar: unica.Avatar, folder: Path) -> train_feed_fo
 
 
 def _measured(run: Finished, avatar: unica.Avatar) -> dict[str, typing.Any]:
-    data = run.data
-    windows = batches.windows(data.held_out, 4, avatar.config.turn_window)
-    chosen = np.unique(np.linspace(0, len(windows.first) - 1, GROUPS).astype(int))
-    error = evaluate.one_step(avatar, data, chosen, jax.random.key(11))
-    sequence = np.asarray(data.held_out.sequence)[windows.first[chosen]]
-    turns = error["turning"]
+    data, (chosen, sequence) = run.data, run.held_out_groups(avatar)
     rolled = unica_motion.roll_long(avatar, data, 0)
     answers = unica_motion.answers(data, avatar, rolled)
     return {
         "autoencoder": bootstrap(evaluate.reconstruction(avatar, data, chosen)["autoencoder"], sequence),
-        "all": bootstrap(error["model"], sequence),
-        "turning": bootstrap(error["model"][turns], sequence[turns]),
-        "copy": bootstrap(error["copy last"], sequence),
-        "copy turning": bootstrap(error["copy last"][turns], sequence[turns]),
+        **run.next_frames(avatar),
         "heading": answers["rollout"]["heading_error"],
         "controller": answers["controller"]["heading_error"],
         "distance": float(1000 * rolled.distance.mean()) if len(rolled.distance) else None,

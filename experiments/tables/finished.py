@@ -16,12 +16,13 @@ from avatarjax import unica
 from avatarjax.data import dataset
 from avatarjax.metrics import fvd, i3d, lpips
 from avatarjax.metrics.statistics import Estimate, bootstrap
-from avatarjax.unica import files, image_quality
+from avatarjax.unica import batches, evaluate, files, image_quality
 from avatarjax.unica.avatar import wear as wear_surface
 from avatarjax.unica.config import DynamicsName
 from experiments.unica_rollout import SCRIPT
 
 NEXT_FRAMES = 50  # of the script, in four views
+GROUPS = 400  # held-out, on which geometry is measured
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +95,25 @@ class Finished:
         """FVD, PSNR and LPIPS of a video (4, f, h, w, 3) of the very frames that the meshes are pictured in."""
         found = image_quality.video_quality(video, self.pictures, self._judged_frames(), _lpips())
         return {"FVD": bootstrap([self.fvd(video)]), **_images(found)}
+
+    def held_out_groups(self, avatar: unica.Avatar) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers (g,) of the held-out groups that errors are measured on, and the sequence (g,) of each."""
+        windows = batches.windows(self.data.held_out, 4, avatar.config.turn_window)
+        chosen = np.unique(np.linspace(0, len(windows.first) - 1, GROUPS).astype(int))
+        return chosen, np.asarray(self.data.held_out.sequence)[windows.first[chosen]]
+
+    def next_frames(self, avatar: unica.Avatar) -> dict[str, Estimate]:
+        """Errors in mm of the next frame on those, "all" and "turning", and of copying the last frame, "copy" and "copy
+        turning"."""
+        chosen, sequence = self.held_out_groups(avatar)
+        error = evaluate.one_step(avatar, self.data, chosen, jax.random.key(11))
+        turns, model, copied = error["turning"], error["model"], error["copy last"]
+        return {
+            "all": bootstrap(model, sequence),
+            "turning": bootstrap(model[turns], sequence[turns]),
+            "copy": bootstrap(copied, sequence),
+            "copy turning": bootstrap(copied[turns], sequence[turns]),
+        }
 
     def judge(self, avatar: unica.Avatar, rollouts: int) -> dict[str, Estimate]:
         """FVD of rollouts with other noise, PSNR and LPIPS of next frames (UNICA 4.2), each with its interval."""
