@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
+from jax.ad_checkpoint import print_saved_residuals
 
 from avatarjax.nets import functional, levels, point_transformer
 from avatarjax.nets.point_transformer import (
@@ -194,3 +195,18 @@ def test_the_papers_network_has_46_million_parameters():
     count = functional.count(functional.shapes(PointTransformer, PointTransformerConfig()))
     print(f"paper point transformer: {count / 1e6:.2f} million parameters")
     assert 45e6 < count < 47e6
+
+
+def test_recomputed_attention_has_the_same_gradients(params, cloud):
+    kept = dataclasses.replace(CONFIG, recompute=False)
+    again = dataclasses.replace(CONFIG, recompute=True)
+    for a, b in zip(*(jax.tree.leaves(gradients(c, params, *cloud)) for c in (kept, again)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("recompute", [False, True])
+def test_recomputed_attention_keeps_no_weights(recompute, capsys):
+    attention = PatchAttention(8, 2, 32, recompute, rngs=nnx.Rngs(0))
+    order = jnp.arange(96)
+    print_saved_residuals(lambda x: attention(x, jnp.asarray(96), order, order), jnp.ones((96, 8)))
+    assert ("32,32]" in capsys.readouterr().out) is not recompute

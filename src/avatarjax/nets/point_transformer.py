@@ -13,7 +13,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from avatarjax.nets import levels as resolutions
 from avatarjax.nets import submanifold
@@ -42,6 +42,7 @@ class PointTransformerConfig:
     grid: int = 192  # code
     expansion: int = 4  # code
     shuffle: bool = True  # code: the curves in another order on every level, in training
+    recompute: bool = True  # ours: gradients compute attention weights again instead of keeping them
     fill: float = 3.0  # ours; the paper's 450,000 points take up to 2.0
 
     def __post_init__(self):
@@ -78,8 +79,8 @@ class PatchAttention(nnx.Module):
     A last, incomplete patch borrows the end of the one before it, so that all are full (PTv3 4.2).
     """
 
-    def __init__(self, channels: int, heads: int, patch: int, *, rngs: nnx.Rngs):
-        self.patch = patch
+    def __init__(self, channels: int, heads: int, patch: int, recompute: bool = False, *, rngs: nnx.Rngs):
+        self.patch, self.recompute = patch, recompute
         self.attention = Attention(channels, heads, rngs=rngs)
 
     def __call__(
@@ -91,24 +92,28 @@ class PatchAttention(nnx.Module):
         starts = jnp.minimum(jnp.arange(patches) * size, jnp.maximum(count - size, 0))
         rows = starts[:, None] + jnp.arange(size)[None]
         # Only where all points together do not fill a patch is there padding in it.
-        attended = self.attention(x[order[rows]], mask=rows < count)
+        attend = jax.checkpoint(self._attend) if self.recompute else self._attend
+        attended = attend(x[order[rows]], rows < count)
         # A point in two patches takes what the one says that is its own.
         own = rank // size
         return attended.reshape(-1, channels)[own * size + rank - starts[own]]
+
+    def _attend(self, patches: Float[Array, "p s c"], known: Bool[Array, "p s"]) -> Float[Array, "p s c"]:
+        return self.attention(patches, mask=known)
 
 
 class Block(nnx.Module):
     """Sparse convolution, patch attention and MLP, each with a residual connection."""
 
-    def __init__(self, channels: int, heads: int, patch: int, expansion: int, *, rngs: nnx.Rngs):
+    def __init__(self, channels: int, heads: int, config: PointTransformerConfig, *, rngs: nnx.Rngs):
         self.position = VoxelConvolution(channels, rngs=rngs)
         self.position_out = nnx.Linear(channels, channels, rngs=rngs)
         self.position_norm = nnx.LayerNorm(channels, rngs=rngs)
         self.norm1 = nnx.LayerNorm(channels, rngs=rngs)
-        self.attention = PatchAttention(channels, heads, patch, rngs=rngs)
+        self.attention = PatchAttention(channels, heads, config.patch, config.recompute, rngs=rngs)
         self.norm2 = nnx.LayerNorm(channels, rngs=rngs)
-        self.up = nnx.Linear(channels, expansion * channels, rngs=rngs)
-        self.down = nnx.Linear(expansion * channels, channels, rngs=rngs)
+        self.up = nnx.Linear(channels, config.expansion * channels, rngs=rngs)
+        self.down = nnx.Linear(config.expansion * channels, channels, rngs=rngs)
 
     def __call__(self, x: Float[Array, "n c"], level: Level, curve: int) -> Float[Array, "n c"]:
         position = self.position_norm(self.position_out(self.position(x, level)))
@@ -121,9 +126,7 @@ class Stage(nnx.Module):
     """Blocks that take the four curves in turn."""
 
     def __init__(self, channels: int, depth: int, heads: int, config: PointTransformerConfig, *, rngs: nnx.Rngs):
-        self.blocks = nnx.List(
-            [Block(channels, heads, config.patch, config.expansion, rngs=rngs) for _ in range(depth)]
-        )
+        self.blocks = nnx.List([Block(channels, heads, config, rngs=rngs) for _ in range(depth)])
 
     def __call__(self, x: Float[Array, "n c"], level: Level) -> Float[Array, "n c"]:
         for k, block in enumerate(self.blocks):

@@ -1,1 +1,1 @@
-"""What UNICA is compared with (Table 2, D.1), built here on the same data: methods that are given the true skeleton."""
+"""What UNICA is compared with (Tables 2 and C, D.1), built here and trained on the same data."""
