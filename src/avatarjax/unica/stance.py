@@ -24,6 +24,8 @@ HEIGHT = 0.015
 SWING = 0.05
 # Sole points a foot.
 POINTS = 8
+# Frames in which some sole point must be seen at rest for there to be a foot.
+SEEN = 10
 ROOT = 3
 
 
@@ -109,7 +111,7 @@ def find_soles(
     sides = []
     for side in (standing[:, 0] > 0, standing[:, 0] < 0):
         best = np.flatnonzero(side)[np.argsort(-often[side], kind="stable")][:POINTS]
-        if len(best) < POINTS or often[best].min() < 0.01 * len(moving):
+        if len(best) < POINTS or often[best[0]] < SEEN or often[best[-1]] < 0.25 * often[best[0]]:
             return None
         sides.append(best)
     soles = np.stack(sides)
