@@ -19,6 +19,7 @@ from avatarjax.metrics import responsiveness
 from avatarjax.unica import batches, evaluate, forecast
 from avatarjax.unica.latent import LatentDynamics
 from experiments import unica_motion
+from experiments.unica_rollout import before_each_action
 
 GROUPS = 256  # held-out groups whose next frame is predicted
 STEP_GROUPS = 64  # of them, for the comparison of sampling steps
@@ -87,8 +88,7 @@ def rollout(avatar: unica.Avatar, data: Dataset, seed: int, frames: int) -> dict
         found["drift_interval"] = [1000 * bound for bound in trend.slope_interval]
     if len(rolled.roots) <= unica_motion.HOLD:
         return found
-    start = np.asarray(unica.reset(avatar, jax.random.key(0)).offset)[None]
-    paths = np.concatenate([start, rolled.roots[:-1]])
+    paths = before_each_action(avatar, rolled.roots)
     return found | answers(paths, rolled.actions, yaw, moves) | {"path": np.round(paths, 3).tolist()}
 
 

@@ -21,6 +21,7 @@ from avatarjax.data.sequences import Recording
 from avatarjax.metrics import drift, foot_slide, joints, motion, responsiveness
 from avatarjax.metrics.statistics import Estimate, bootstrap
 from avatarjax.unica import fit, forecast
+from experiments.unica_rollout import before_each_action
 
 LONG = 2000  # frames of a rollout, as UNICA Fig. 6
 HOLD = 60  # frames a key is held in it, as UNICA C.4
@@ -80,10 +81,9 @@ def asked(data: Dataset, actions: int) -> tuple[np.ndarray, np.ndarray]:
 def answers(data: Dataset, avatar: unica.Avatar, rolled: Long) -> dict[str, dict[str, typing.Any]]:
     """Frames of turning by the angle asked for, and heading error: of the long rollout and the held-out recordings."""
     yaw, moves = asked(data, avatar.config.actions)
-    start = np.asarray(unica.reset(avatar, jax.random.key(0)).offset)[None]
     found = {"rollout": []}
     if len(rolled.roots) > HOLD:
-        paths = np.concatenate([start, rolled.roots[:-1]])
+        paths = before_each_action(avatar, rolled.roots)
         found["rollout"] = [responsiveness.responses(paths, rolled.actions, yaw, moves)]
     found["controller"] = [
         responsiveness.responses(roots, actions, yaw, moves) for roots, actions in _sequences(data.held_out)

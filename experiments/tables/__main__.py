@@ -86,9 +86,9 @@ def run_tables(args: Args) -> list[Table]:
         "times": lambda: long.times(runs, notebook),
         "sliding": lambda: long.sliding(runs, notebook, folder),
         "components": lambda: figures.components(runs, notebook, folder),
-        "novelty": lambda: figures.novelty(runs, notebook, folder),
-        "trail": lambda: figures.trail(runs, notebook, folder),
-        "strips": lambda: figures.strips(runs, notebook, folder),
+        "novelty": lambda: figures.novelty(runs, folder),
+        "trail": lambda: figures.trail(runs, folder),
+        "strips": lambda: figures.strips(runs, folder),
     }
     made = []
     for name in args.names:

@@ -19,6 +19,7 @@ from avatarjax.unica.train import Run
 from experiments import pictures, unica_motion
 from experiments.tables.finished import Finished
 from experiments.tables.table import Notebook, Table, cell
+from experiments.unica_rollout import before_each_action
 
 OURS, UNET = "feed-forward", "diffusion"
 LITTLE = 0.25  # of the controller's progress: an avatar that makes less is not driven
@@ -98,8 +99,7 @@ def _measured(run: Finished, avatar: unica.Avatar) -> dict[str, typing.Any]:
 
 def _way(avatar: unica.Avatar, data: Dataset) -> dict[str, float]:
     """What `travelled` says of a rollout of the report's script."""
-    start = np.asarray(unica.reset(avatar, jax.random.key(0)).offset)[None]
-    roots = np.concatenate([start, np.asarray(_scripted(avatar, data.truth.actions).root)[:-1]])
+    roots = before_each_action(avatar, np.asarray(_scripted(avatar, data.truth.actions).root))
     return travelled(roots, data.truth.actions, *unica_motion.asked(data, avatar.config.actions))
 
 

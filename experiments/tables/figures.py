@@ -59,15 +59,10 @@ def _components(run: Finished) -> dict[int, float]:
     held = training.coefficient_frames(run.data, run.data.held_out)[0]
     held = held[np.unique(np.linspace(0, len(held) - 1, POSES).astype(int))]
     most = min(*train.shape, COUNTS[-1] + 1) - 1
-    found = pcs.fit(train, most, jax.random.key(0))
-    centred, basis, errors = held - np.asarray(found.mean), np.asarray(found.basis), {}
-    for count in (c for c in COUNTS if c <= most):
-        back = (centred @ basis[:count].T @ basis[:count] - centred).reshape(len(held), -1, 3)
-        errors[count] = float(evaluate.millimetres(back, np.zeros_like(back), 1.0).mean())
-    return errors
+    return evaluate.projection_errors(pcs.fit(train, most, jax.random.key(0)), held, COUNTS, 1.0)
 
 
-def novelty(runs: list[Finished], notebook: Notebook, folder: Path) -> Table:
+def novelty(runs: list[Finished], folder: Path) -> Table:
     """UNICA Fig. C (f): the generated pose that is furthest from all training poses, beside the nearest of them."""
     rows, shown = [], []
     for run in runs:
@@ -93,7 +88,7 @@ def novelty(runs: list[Finished], notebook: Notebook, folder: Path) -> Table:
     )
 
 
-def trail(runs: list[Finished], notebook: Notebook, folder: Path) -> Table:
+def trail(runs: list[Finished], folder: Path) -> Table:
     """UNICA Fig. 5: every third frame of a rollout, composited into one scene."""
     shown = []
     for run in runs:
@@ -116,7 +111,7 @@ def trail(runs: list[Finished], notebook: Notebook, folder: Path) -> Table:
     return Table("Trails (UNICA Fig. 5)", caption, [], [], pictures=shown)
 
 
-def strips(runs: list[Finished], notebook: Notebook, folder: Path) -> Table:
+def strips(runs: list[Finished], folder: Path) -> Table:
     """UNICA Figs. I to L: consecutive frames with the key of each, of a start, two turns and a stop."""
     shown = []
     changes = [k for k in range(len(SCRIPT)) if k == 0 or SCRIPT[k] != SCRIPT[k - 1]]

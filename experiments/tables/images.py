@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import typing
 
 from avatarjax import unica
@@ -11,8 +10,8 @@ from avatarjax.metrics.statistics import Estimate
 from avatarjax.unica.config import DynamicsName
 from experiments.tables.finished import Finished
 from experiments.tables.table import BETTER, Notebook, Table, ordering
+from experiments.unica_dynamics_measures import SAMPLING_STEPS, with_steps
 
-STEPS = (1, 2, 4, 10, 20)
 HOW = (
     "FVD of rollouts of the report's script against the meshes under the same keys (mean of four views; n rollouts "
     "with other noise), PSNR and LPIPS of next frames from three true ones (n pictures in so many poses)."
@@ -41,7 +40,7 @@ def steps(runs: list[Finished], notebook: Notebook, rollouts: int, dynamics: Dyn
     run = runs[0]
     avatar = run.avatar(dynamics)
     found = {}
-    for count in STEPS:
+    for count in SAMPLING_STEPS:
         found[count] = _judged(run, dynamics, f"{count} steps", with_steps(avatar, count), notebook, rollouts)
     return _against_paper(
         f"Sampling steps of the {dynamics} model, {run.name}, {run.folder.name} (UNICA Table B)",
@@ -49,13 +48,6 @@ def steps(runs: list[Finished], notebook: Notebook, rollouts: int, dynamics: Dyn
         found,
         published.UNICA_B,
     )
-
-
-def with_steps(avatar: unica.Avatar, count: int) -> unica.Avatar:
-    """The avatar with another number of sampling steps."""
-    field = "latent" if avatar.config.dynamics == "unet" else "coefficients"
-    changed = dataclasses.replace(getattr(avatar.config, field), sample_steps=count)
-    return avatar.replace(config=dataclasses.replace(avatar.config, **{field: changed}))
 
 
 def _judged(

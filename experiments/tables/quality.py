@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -104,6 +105,7 @@ def rigged_truth(run: Finished) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(posed), np.asarray(truth.roots[:frames])
 
 
+@functools.cache
 def rig_surface(run: Finished) -> rigging.Rigged:
     """Skinning weights from poses spread over the training data."""
     rig = avatars.build(run.name).rig

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -112,9 +112,17 @@ def components(avatar: Avatar, data: Dataset, chosen: Int[np.ndarray, "g"]) -> d
     else:
         pca, scale = avatar.dynamics.basis, 1.0
         flat = training.coefficient_frames(data, data.held_out)[0][windows.frames(chosen)[:, 3]]
+    return projection_errors(pca, flat, sorted({1, 2, 4, 8, 16, 32, 64, 120, len(pca.basis)}), scale)
+
+
+def projection_errors(
+    pca: pcs.PCA, flat: Float[np.ndarray, "g d"], counts: Sequence[int], scale: float
+) -> dict[int, float]:
+    """Mean error in mm of flattened maps, `scale` units a metre, against how many components are kept; counts that the
+    basis does not have are left out."""
     centred, basis = flat - np.asarray(pca.mean), np.asarray(pca.basis)
     errors = {}
-    for count in sorted({1, 2, 4, 8, 16, 32, 64, 120, len(basis)}):
+    for count in counts:
         if count <= len(basis):
             back = (centred @ basis[:count].T @ basis[:count] - centred).reshape(len(centred), -1, 3)
             errors[count] = float(millimetres(back, np.zeros_like(back), scale).mean())

@@ -74,7 +74,7 @@ def hold(
     def correct(before, after, step):
         (stood, low), (stands, still_low) = feet(before), feet(after)
         there = turned(step[2], stands)
-        slid = there + step[None, :2] - turned(0.0, stood)
+        slid = there + step[None, :2] - stood[:, ::2]
         resting = (low < HEIGHT) & (still_low < HEIGHT) & (jnp.sum(slid**2, axis=1) < SWING**2)
         seen = jnp.repeat(resting.astype(slid.dtype), 2)
         # How the ground positions change with the pose, with the root's place and with its heading.
@@ -115,7 +115,7 @@ def find_soles(
             return None
         sides.append(best)
     soles = np.stack(sides)
-    middles = np.linalg.norm(np.diff([then[:, soles].mean(2), now[:, soles].mean(2)], axis=0)[0][..., [0, 2]], axis=-1)
+    middles = np.linalg.norm((now[:, soles].mean(2) - then[:, soles].mean(2))[..., [0, 2]], axis=-1)
     standing_still = (now[:, soles, 1].min(2) < HEIGHT) & (then[:, soles, 1].min(2) < HEIGHT) & (middles < SWING)
     return soles, float(np.median(middles[standing_still]))
 

@@ -12,20 +12,13 @@ from avatarjax.nets import functional
 from avatarjax.nets.functional import bind
 from avatarjax.unica import batches, evaluate, forecast
 from avatarjax.unica.baselines import feed_forward, vq
-from avatarjax.unica.baselines.feed_forward import FeedForwardConfig, FeedForwardDynamics, Transformer
+from avatarjax.unica.baselines.feed_forward import FeedForwardDynamics, Transformer
 from avatarjax.unica.config import preset
 from avatarjax.unica.denoiser import Denoiser
-from avatarjax.unica.vae import VAE, VAEConfig
+from avatarjax.unica.vae import VAE
 from tests.parameters import random_params
+from tests.unica.baselines.conftest import SIZES
 
-SIZES = FeedForwardConfig(
-    vae=VAEConfig(channels=(8, 16, 16), residual_blocks=1, latent_channels=6),
-    side=8,
-    width=16,
-    depth=2,
-    heads=2,
-    codes=32,
-)
 ACTIONS = np.array([1, 3, 0], np.int32)
 
 

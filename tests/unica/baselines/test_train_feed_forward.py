@@ -10,18 +10,8 @@ import pytest
 from avatarjax.train import read_metrics
 from avatarjax.unica import train
 from avatarjax.unica.baselines import feed_forward, train_feed_forward
-from avatarjax.unica.baselines.feed_forward import FeedForwardConfig
 from avatarjax.unica.config import StageConfig
-from avatarjax.unica.vae import VAEConfig
-
-SIZES = FeedForwardConfig(
-    vae=VAEConfig(channels=(8, 16, 16), residual_blocks=1, latent_channels=6),
-    side=8,
-    width=16,
-    depth=2,
-    heads=2,
-    codes=32,
-)
+from tests.unica.baselines.conftest import SIZES
 
 
 @pytest.fixture(scope="module")
