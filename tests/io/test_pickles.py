@@ -39,6 +39,35 @@ def test_arrays_of_numpy_1_come_back(tmp_path):
     np.testing.assert_array_equal(pickles.load_arrays(path), np.arange(3))
 
 
+@pytest.mark.parametrize("protocol", [2, 3, 4])
+def test_dictionaries_that_numpy_saved_come_back(tmp_path, protocol):
+    value = {"K": [np.eye(3)], "scale": np.float32(2.5), "names": np.array(["a", "b"])}
+    path = tmp_path / "annots.npy"
+    np.save(path, value, allow_pickle=True)
+    header = path.read_bytes()[:128]
+    path.write_bytes(header + pickle.dumps(np.array(value, object), protocol))
+    found = pickles.load_npy(path)
+    np.testing.assert_array_equal(found["K"][0], np.eye(3))
+    np.testing.assert_array_equal(found["names"], value["names"])
+    assert found["scale"] == 2.5 and found["scale"].dtype == np.float32
+
+
+def test_plain_npy_arrays_come_back(tmp_path):
+    value = np.asfortranarray(np.arange(6.0).reshape(2, 3))
+    np.save(tmp_path / "a.npy", value)
+    np.testing.assert_array_equal(pickles.load_npy(tmp_path / "a.npy"), value)
+    np.save(tmp_path / "b.npy", np.array([{"x": 1}, None]), allow_pickle=True)
+    assert pickles.load_npy(tmp_path / "b.npy").tolist() == [{"x": 1}, None]
+
+
+def test_an_npy_file_that_lies_about_its_shape_is_refused(tmp_path):
+    path = tmp_path / "annots.npy"
+    np.save(path, {"x": 1}, allow_pickle=True)
+    path.write_bytes(path.read_bytes()[:128] + pickle.dumps([1]))
+    with pytest.raises(ValueError, match=r"annots\.npy is damaged or holds more than arrays: no array of shape \(\)"):
+        pickles.load_npy(path)
+
+
 class Runs:
     """Unpickled plainly, this would run a command."""
 

@@ -10,7 +10,7 @@ poses.npz                          rotations (f, j, 3, 3), root_rotation (f, 3, 
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import json
 import os
 import shutil
@@ -22,74 +22,36 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, UInt8
 
 from avatarjax.cameras import Camera
-from avatarjax.data.importers import series
+from avatarjax.data.importers import dress4d, series, zju_mocap
+from avatarjax.data.importers.recording import MonocularVideo, Poses, check_poses, not_rotations
 from avatarjax.io import atomic, exr, video
 
 VIDEO, IMAGES, MASKS, CAMERAS, POSES = "video.mp4", "images", "masks", "cameras.json", "poses.npz"
 
 
-@typing.no_type_check
-@dataclasses.dataclass(frozen=True, eq=False)
-class Poses:
-    """Poses over f frames in our axes and metres: rotations (f, j, 3, 3) of joints relative to their parents,
-    root_rotation (f, 3, 3) and root_translation (f, 3) to the world; names (j,) and parents (j,), -1 for a root, or
-    None.
-    """
-
-    rotations: Float[np.ndarray, "f j 3 3"]
-    root_rotation: Float[np.ndarray, "f 3 3"]
-    root_translation: Float[np.ndarray, "f 3"]
-    names: tuple[str, ...] | None = None
-    parents: tuple[int, ...] | None = None
-
-    def __len__(self) -> int:
-        return len(self.rotations)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class MonocularVideo:
-    """f frames of one person: masks (f, h, w), a camera (one, or a batch of f), poses, and RGB frames.
-
-    Iterate over `frames()` to decode one (h, w, 3) uint8 image at a time; `images()` holds all of them.
-    """
-
-    folder: Path
-    masks: np.ndarray
-    camera: Camera
-    poses: Poses
-    fps: float
-    _loaded: np.ndarray | None = None
-
-    def __len__(self) -> int:
-        return len(self.masks)
-
-    def frames(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-        """The RGB frames in order, decoded as they are asked for."""
-        return iter(self._loaded) if self._loaded is not None else _decode(self.folder, self.camera)
-
-    def images(self) -> UInt8[np.ndarray, "f h w 3"]:
-        """All RGB frames at once."""
-        return self._loaded if self._loaded is not None else np.stack(list(self.frames()))
-
-    def camera_at(self, frame: int) -> Camera:
-        """The camera of one frame."""
-        if self.camera.world_to_camera.ndim == 2:
-            return self.camera
-        return self.camera.replace(
-            world_to_camera=self.camera.world_to_camera[frame], intrinsics=self.camera.intrinsics[frame]
-        )
-
-
-def load_monocular(folder: str | os.PathLike, *, lazy: bool = True) -> MonocularVideo:
+def load_monocular(folder: str | os.PathLike, *, camera: str | None = None, lazy: bool = True) -> MonocularVideo:
     """Load a monocular folder; with `lazy` RGB frames stay in their files until they are asked for.
 
-    Raises ValueError that names the file for whatever is missing or damaged, for sizes that differ, and where frames,
-    masks, cameras and poses do not count the same.
+    A sequence of ZJU-MoCap or a take of 4D-DRESS, in the layout in which each is published, is recognised: `camera`
+    then names the one to look through, by default the first. Raises ValueError that names the file for whatever is
+    missing or damaged, for sizes that differ, and where frames, masks, cameras and poses do not count the same.
     """
     folder = Path(folder)
+    if zju_mocap.recognises(folder):
+        loaded = zju_mocap.load(folder, camera)
+    elif dress4d.recognises(folder):
+        loaded = dress4d.load(folder, camera)
+    elif camera is not None:
+        raise ValueError(f"{folder} is filmed by one camera: camera={camera!r} is for ZJU-MoCap and 4D-DRESS only")
+    else:
+        loaded = _load(folder)
+    return loaded if lazy else loaded.held()
+
+
+def _load(folder: Path) -> MonocularVideo:
     for name in (CAMERAS, POSES, MASKS):
         if not (folder / name).exists():
             raise ValueError(f"{folder} has no {name}: a monocular folder needs video.mp4 or images, masks, "
@@ -104,8 +66,7 @@ def load_monocular(folder: str | os.PathLike, *, lazy: bool = True) -> Monocular
     for what, length in lengths.items():
         if length != count:
             raise ValueError(f"{folder} has {count} frames and {length} {what}: give one for each frame")
-    loaded = None if lazy else np.stack(list(_decode(folder, camera)))
-    return MonocularVideo(folder, masks, camera, poses, fps, loaded)
+    return MonocularVideo(folder, masks, camera, poses, fps, functools.partial(_decode, folder, camera))
 
 
 def write_monocular(
@@ -127,7 +88,7 @@ def write_monocular(
         raise ValueError(f"{folder} exists and is not empty: choose another folder, or delete it")
     if as_video and (camera.width % 2 or camera.height % 2):
         raise ValueError(f"a video needs even sides, got {camera.width}x{camera.height}: write images instead")
-    _check_poses(poses, folder / POSES)
+    check_poses(poses, folder / POSES)
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -245,7 +206,7 @@ def _read_cameras(path: Path) -> Camera:
             f"{path}: world_to_camera must be 4x4 and intrinsics 3x3, got {views.shape}, {intrinsics.shape}"
         )
     rotations = views[:, :3, :3]
-    if not (np.isfinite(views).all() and np.isfinite(intrinsics).all()) or _not_rotations(rotations):
+    if not (np.isfinite(views).all() and np.isfinite(intrinsics).all()) or not_rotations(rotations):
         raise ValueError(f"{path}: a camera is not finite, or its rotation is none (no scale, no reflection)")
     pair = jnp.asarray(views, jnp.float32), jnp.asarray(intrinsics, jnp.float32)
     return Camera(*(pair if len(views) > 1 else (pair[0][0], pair[1][0])), width, height)
@@ -279,29 +240,5 @@ def _read_poses(path: Path) -> Poses:
         names=tuple(str(name) for name in arrays["names"]) if "names" in arrays else None,
         parents=tuple(int(parent) for parent in arrays["parents"]) if "parents" in arrays else None,
     )
-    _check_poses(poses, path)
+    check_poses(poses, path)
     return poses
-
-
-def _check_poses(poses: Poses, path: Path) -> None:
-    shape = poses.rotations.shape
-    if poses.rotations.ndim != 4 or shape[2:] != (3, 3):
-        raise ValueError(f"{path}: rotations must be of shape (f, j, 3, 3), got {shape}")
-    if poses.root_rotation.shape != (shape[0], 3, 3) or poses.root_translation.shape != (shape[0], 3):
-        found = poses.root_rotation.shape, poses.root_translation.shape
-        raise ValueError(f"{path}: root_rotation and root_translation of shapes {found} do not fit {shape[0]} frames")
-    for name, values in (("rotations", poses.rotations), ("root_rotation", poses.root_rotation)):
-        if _not_rotations(values):
-            raise ValueError(f"{path}: {name} holds a matrix that is no rotation: orthonormalise it")
-    if not np.isfinite(poses.root_translation).all():
-        raise ValueError(f"{path}: root_translation is not finite")
-    for name, values in (("names", poses.names), ("parents", poses.parents)):
-        if values is not None and len(values) != shape[1]:
-            raise ValueError(f"{path}: {len(values)} {name} for {shape[1]} joints")
-
-
-def _not_rotations(matrices: np.ndarray) -> bool:
-    if not np.isfinite(matrices).all():
-        return True
-    products = np.swapaxes(matrices, -1, -2) @ matrices
-    return bool((np.abs(products - np.eye(3)) > 1e-2).any() or (np.linalg.det(matrices) < 0).any())

@@ -1,0 +1,115 @@
+"""What a single camera sees of a person: frames, masks, cameras and poses, wherever they were read from."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from avatarjax.cameras import Camera
+from avatarjax.io import exr
+
+
+@typing.no_type_check
+@dataclasses.dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses over f frames in our axes and metres: rotations (f, j, 3, 3) of joints relative to their parents,
+    root_rotation (f, 3, 3) and root_translation (f, 3) to the world; names (j,) and parents (j,), -1 for a root, or
+    None.
+    """
+
+    rotations: Float[np.ndarray, "f j 3 3"]
+    root_rotation: Float[np.ndarray, "f 3 3"]
+    root_translation: Float[np.ndarray, "f 3"]
+    names: tuple[str, ...] | None = None
+    parents: tuple[int, ...] | None = None
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MonocularVideo:
+    """f frames of one person: masks (f, h, w), a camera (one, or a batch of f), poses, and RGB frames.
+
+    Iterate over `frames()` to decode one (h, w, 3) uint8 image at a time; `images()` holds all of them. `decode()`
+    begins to read them from their files.
+    """
+
+    folder: Path
+    masks: np.ndarray
+    camera: Camera
+    poses: Poses
+    fps: float
+    decode: Callable[[], Iterator[np.ndarray]]
+    _loaded: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.masks)
+
+    def frames(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        """The RGB frames in order, decoded as they are asked for."""
+        return iter(self._loaded) if self._loaded is not None else self.decode()
+
+    def images(self) -> UInt8[np.ndarray, "f h w 3"]:
+        """All RGB frames at once."""
+        return self._loaded if self._loaded is not None else np.stack(list(self.frames()))
+
+    def camera_at(self, frame: int) -> Camera:
+        """The camera of one frame."""
+        if self.camera.world_to_camera.ndim == 2:
+            return self.camera
+        return self.camera.replace(
+            world_to_camera=self.camera.world_to_camera[frame], intrinsics=self.camera.intrinsics[frame]
+        )
+
+    def held(self) -> MonocularVideo:
+        """The same video with all of its frames in memory."""
+        return dataclasses.replace(self, _loaded=self.images())
+
+
+def check_poses(poses: Poses, path: Path) -> None:
+    """ValueError that names `path`, their file, where the parts of poses do not fit each other or are no rotations."""
+    shape = poses.rotations.shape
+    if poses.rotations.ndim != 4 or shape[2:] != (3, 3):
+        raise ValueError(f"{path}: rotations must be of shape (f, j, 3, 3), got {shape}")
+    if poses.root_rotation.shape != (shape[0], 3, 3) or poses.root_translation.shape != (shape[0], 3):
+        found = poses.root_rotation.shape, poses.root_translation.shape
+        raise ValueError(f"{path}: root_rotation and root_translation of shapes {found} do not fit {shape[0]} frames")
+    for name, values in (("rotations", poses.rotations), ("root_rotation", poses.root_rotation)):
+        if not_rotations(values):
+            raise ValueError(f"{path}: {name} holds a matrix that is no rotation: orthonormalise it")
+    if not np.isfinite(poses.root_translation).all():
+        raise ValueError(f"{path}: root_translation is not finite")
+    for name, values in (("names", poses.names), ("parents", poses.parents)):
+        if values is not None and len(values) != shape[1]:
+            raise ValueError(f"{path}: {len(values)} {name} for {shape[1]} joints")
+
+
+def not_rotations(matrices: Float[np.ndarray, "*b 3 3"]) -> bool:
+    """Whether any matrix is not finite, or no rotation to one per cent."""
+    if not np.isfinite(matrices).all():
+        return True
+    products = np.swapaxes(matrices, -1, -2) @ matrices
+    return bool((np.abs(products - np.eye(3)) > 1e-2).any() or (np.linalg.det(matrices) < 0).any())
+
+
+def read_sized(path: Path, camera: Camera) -> UInt8[np.ndarray, "h w c"]:
+    """The pixels of a picture that this camera took; ValueError that names a file of another size."""
+    pixels = exr.read_png(path)
+    if pixels.shape[:2] != (camera.height, camera.width):
+        raise ValueError(f"{path} has shape {pixels.shape[:2]}, the first image {(camera.height, camera.width)}")
+    return pixels
+
+
+def read_rgb(paths: Iterable[Path], camera: Camera) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """The RGB pictures that this camera took, read as they are asked for; ValueError that names what is none."""
+    for path in paths:
+        pixels = read_sized(path, camera)
+        if pixels.shape[2] < 3:
+            raise ValueError(f"{path} has {pixels.shape[2]} channels, expected RGB")
+        yield np.ascontiguousarray(pixels[..., :3])
