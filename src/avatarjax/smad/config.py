@@ -1,0 +1,119 @@
+"""Sizes and numbers of a SMAD run, as frozen dataclasses with presets by name.
+
+Presets run the same code with different numbers: `ci` in minutes on two CPU cores, `small` is the default on a CPU,
+`base` and `paper` have the paper's sizes. A comment says whose a value is where it is not the paper's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Callable
+
+Aggregation = typing.Literal["mean", "adjacency"]
+PresetName = typing.Literal["ci", "small", "base", "paper"]
+
+
+@dataclasses.dataclass(frozen=True)
+class GraphConfig:
+    """How many nodes, and how many nearest neighbours make an edge. bandwidth: rho_a in metres, None for the mean
+    length of the edges (ours: the paper has no number)."""
+
+    nodes: int = 40_000
+    neighbours: int = 16
+    bandwidth: float | None = None
+
+    def __post_init__(self):
+        if not 1 <= self.neighbours < self.nodes:
+            raise ValueError(f"{self.neighbours} neighbours need more nodes than {self.nodes}")
+
+
+@dataclasses.dataclass(frozen=True)
+class DeformerConfig:
+    """The deformation network (SMAD 3.2, B.2, Tables G and H), and what of it an ablation switches off.
+
+    The first columns of Tables 2 and 4 come from the defaults by `velocities` (tau_v + 1: 0 is B0, 2 is B1),
+    `edge_features=False` (the vanilla GNN: messages of two hidden states alone), `adaptive_stiffness=False` (before
+    A2), `codes=0` (before A4), and `iterations=0`, with which no node hears of another.
+    """
+
+    pose: int = 72  # ours: numbers of one body pose, as SMPL's 24 axis-angle joints have
+    pose_window: int = 6  # ours: frames of poses, tau + 1
+    pose_width: int = 256
+    pose_embedding: int = 128
+    velocities: int = 12  # of each node, newest first: tau_v + 1
+    node_features: int = 0  # ours: further numbers of each node
+    hidden: int = 256
+    message: int = 128
+    iterations: int = 3
+    aggregation: Aggregation = "mean"  # B.2; "adjacency" is Eq. 5
+    edge_features: bool = True
+    strain: bool = False  # ours: how far an edge is stretched, metres, as one more feature of it
+    adaptive_stiffness: bool = True  # a learned k_ij for each edge; ours: it weighs the messages
+    decoder: tuple[int, int] = (256, 128)
+    codes: int = 16  # ours: length of each Gaussian's latent code z_i; 0: none
+
+    def __post_init__(self):
+        for name in ("pose", "pose_window", "pose_width", "pose_embedding", "hidden", "message"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be positive")
+        for name in ("velocities", "node_features", "iterations", "codes"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
+        if self.aggregation not in typing.get_args(Aggregation):
+            known = ", ".join(typing.get_args(Aggregation))
+            raise ValueError(f"unknown aggregation {self.aggregation!r}: choose one of {known}")
+        if self.strain and not self.edge_features:
+            raise ValueError("strain is a feature of an edge: it needs edge_features")
+
+    @property
+    def node_inputs(self) -> int:
+        """Numbers of one node that enter the projection, its pose embedding not among them."""
+        return 3 + 3 * self.velocities + self.node_features
+
+    @property
+    def edge_inputs(self) -> int:
+        """Numbers of one directed edge; 519 as published."""
+        geometry = 3 + 3 * (self.velocities > 0) + 1 + self.strain
+        return 2 * self.hidden + geometry * self.edge_features
+
+
+@dataclasses.dataclass(frozen=True)
+class SmadConfig:
+    """A whole run."""
+
+    graph: GraphConfig = GraphConfig()
+    deformer: DeformerConfig = DeformerConfig()
+
+
+def _small() -> SmadConfig:
+    return SmadConfig(
+        graph=GraphConfig(nodes=2_000),
+        deformer=DeformerConfig(
+            pose_width=128, pose_embedding=64, hidden=128, message=64, decoder=(128, 64), codes=8, strain=True
+        ),
+    )
+
+
+def _ci() -> SmadConfig:
+    return SmadConfig(
+        graph=GraphConfig(nodes=300, neighbours=8),
+        deformer=DeformerConfig(
+            pose_width=64, pose_embedding=32, hidden=64, message=32, decoder=(64, 32), codes=4, strain=True
+        ),
+    )
+
+
+PRESETS: dict[str, Callable[[], SmadConfig]] = {
+    "ci": _ci,
+    "small": _small,
+    "base": SmadConfig,
+    "paper": SmadConfig,
+}
+
+
+def preset(name: str, **changes: typing.Any) -> SmadConfig:
+    """The preset of this name with fields replaced; ValueError that lists the names for an unknown one."""
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset {name!r}: choose one of {', '.join(PRESETS)}")
+    return dataclasses.replace(PRESETS[name](), **changes)
