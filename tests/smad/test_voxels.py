@@ -62,7 +62,7 @@ def test_gaussians_are_round_and_as_wide_as_they_lie_apart():
     assert len(cloud) == 4000
     near, _ = cKDTree(np.asarray(cloud.means)).query(np.asarray(cloud.means), k=4)
     assert np.ptp(np.asarray(cloud.log_scales), axis=1).max() == 0
-    np.testing.assert_allclose(cloud.scales[:, 0], 0.6 * np.sqrt((near[:, 1:] ** 2).mean(1)), rtol=1e-3)
+    np.testing.assert_allclose(cloud.scales[:, 0], 0.45 * np.sqrt((near[:, 1:] ** 2).mean(1)), rtol=1e-3)
 
 
 def test_too_few_points_are_refused():

@@ -1,7 +1,7 @@
 """Gaussians from the visual hull: what all silhouettes of a turning person allow, coloured by what was seen of it.
 
 A stand-in for the deformable radiance field of SMAD's baselines (section 3) that takes a second instead of hours: the
-hull (Laurentini 1994, "The visual hull concept") of the masks in the body's frame, in which the turning person is seen
+hull (Laurentini 1994, "The visual hull concept") of the masks in the body frame, in which the turning person is seen
 from all around. It is as good as the person holds still in that frame: limbs and cloth move, so that a voxel only has
 to lie inside most silhouettes, and hollows that no silhouette shows are filled.
 """
@@ -37,13 +37,13 @@ _FACING = 2
 
 @dataclasses.dataclass(frozen=True)
 class HullConfig:
-    """box: where the body may be, metres in its frame, about the pelvis; the grid then shrinks to what is there.
+    """box: where the body may be, metres in its frame, about the root; the grid then shrinks to what is there.
     resolution: voxels along its longest side. fraction: of the frames that see a voxel, those in whose silhouette it
     must lie. frames: at most so many are used, spread evenly. gaussians: about so many come out, of this opacity."""
 
     box: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-1.0, -1.3, -1.0), (1.0, 1.3, 1.0))
     resolution: int = 96
-    fraction: float = 0.9
+    fraction: float = 0.95
     frames: int = 120
     gaussians: int = 5000
     opacity: float = 0.8
@@ -59,14 +59,14 @@ class HullConfig:
 @typing.no_type_check
 @flax.struct.dataclass
 class Hull:
-    """Which voxels (x, y, z) of a grid in the body's frame the silhouettes allow."""
+    """Which voxels (x, y, z) of a grid in the body frame the silhouettes allow."""
 
     grid: Grid
     occupied: Bool[Array, "x y z"]
 
 
 def initialise(video: MonocularVideo, config: HullConfig = HullConfig()) -> Gaussians:
-    """Canonical Gaussians (SMAD's G^c, Fig. 2) of the person in a video, in the frame of the body.
+    """Canonical Gaussians (SMAD's G^c, Fig. 2) of the person in a video, in the body frame.
 
     Raises ValueError where masks are empty, do not count as the poses or do not fit the camera, and where no voxel lies
     in enough silhouettes.
@@ -82,7 +82,7 @@ def initialise(video: MonocularVideo, config: HullConfig = HullConfig()) -> Gaus
 
 
 def carve(masks: Bool[np.ndarray, "f h w"], cameras: Camera, config: HullConfig = HullConfig()) -> Hull:
-    """The hull of silhouettes (f, h, w) that were seen by cameras (f,) of the body's frame.
+    """The hull of silhouettes (f, h, w) that were seen by cameras (f,) of the body frame.
 
     A coarse grid over the whole box finds where the body is, a fine one over that holds the hull.
     """

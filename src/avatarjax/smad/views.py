@@ -1,7 +1,7 @@
 """A monocular video as a camera that moves about a body which holds still.
 
-Poses say how the body's frame, at the pelvis, lies in the world in every frame. In that frame, the canonical one, what
-is rigid to the pelvis does not move: a person who turns before one camera is seen from all sides, as a statue would be.
+In the body frame of `driving`, which is the canonical space of everything here, what follows the root does not move: a
+person who turns before one camera is seen from all sides, as a statue would be.
 """
 
 from __future__ import annotations
@@ -10,25 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from avatarjax import rotations
 from avatarjax.cameras import Camera
 from avatarjax.data.importers.recording import MonocularVideo
+from avatarjax.smad import driving
 
 
 def body_cameras(camera: Camera, root_rotation: Float[Array, "f 3 3"], root_translation: Float[Array, "f 3"]) -> Camera:
-    """The cameras (f,) of all frames in the body's frame, from one camera of the world or a batch of f.
-
-    A body point x lies at root_rotation @ x + root_translation, metres.
-    """
+    """The cameras (f,) of all frames in the body frame, from one camera of the world or a batch of f."""
     frames = len(root_rotation)
-    body_to_world = jnp.zeros((frames, 4, 4)).at[:, 3, 3].set(1.0)
-    body_to_world = body_to_world.at[:, :3, :3].set(root_rotation).at[:, :3, 3].set(root_translation)
+    body_to_world = jnp.zeros((frames, 4, 4)).at[:, 3, 3].set(1.0).at[:, :3, 3].set(root_translation)
+    body_to_world = body_to_world.at[:, :3, :3].set(rotations.yaw_matrix(driving.yaw(root_rotation)))
     world_to_camera = jnp.broadcast_to(camera.world_to_camera, (frames, 4, 4))
     intrinsics = jnp.broadcast_to(camera.intrinsics, (frames, 3, 3))
     return camera.replace(world_to_camera=world_to_camera @ body_to_world, intrinsics=intrinsics)
 
 
 def of_video(video: MonocularVideo, frames: Int[np.ndarray, " k"]) -> Camera:
-    """The cameras (k,) of some frames of a video in the body's frame."""
+    """The cameras (k,) of some frames of a video in the body frame."""
     camera = video.camera
     if camera.world_to_camera.ndim == 3:
         camera = camera.replace(world_to_camera=camera.world_to_camera[frames], intrinsics=camera.intrinsics[frames])

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from avatarjax.gaussians import Gaussians
 from avatarjax.smad import graph
 
-# Round Gaussians at a distance d cover a surface without holes or blur at about this share of d.
-_COVER = 0.6
+# Round Gaussians at a distance d cover a surface without holes, and widen it least, at about this share of d.
+_COVER = 0.45
 
 
 @typing.no_type_check
