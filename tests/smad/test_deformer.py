@@ -52,15 +52,11 @@ def assert_close(found, expected, **tolerance):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **tolerance), found, expected)
 
 
-VARIANTS = [
-    {},
-    {"strain": False, "velocities": 0, "codes": 0},
-    {"strain": False, "edge_features": False, "node_features": 0},
-    {"aggregation": "adjacency", "adaptive_stiffness": False, "iterations": 1},
-]
+NO_HISTORY = {"velocities": 0, "strain": False, "codes": 0, "adaptive_stiffness": False, "aggregation": "adjacency"}
+VANILLA = {"edge_features": False, "strain": False, "node_features": 0, "iterations": 1}
 
 
-@pytest.mark.parametrize("changes", VARIANTS, ids=str)
+@pytest.mark.parametrize("changes", [{}, NO_HISTORY, VANILLA], ids=["full", "no history", "vanilla"])
 def test_factored_edges_equal_plain_ones_in_float64(graph, changes):
     """To 1e-12, the outputs and the gradients by parameters, positions and velocities."""
     config = dataclasses.replace(CONFIG, **changes)
@@ -162,6 +158,13 @@ def test_messages_reach_as_far_as_there_are_iterations(graph):
     assert not changed[~near].any() and changed[near & ~closer].any()
 
 
+def test_without_iterations_no_node_hears_of_another(graph):
+    config = dataclasses.replace(CONFIG, iterations=0)
+    params, (pose, x, v, f) = random_params(config, graph), inputs(config, graph)
+    here, there = (deform(config, params, graph, pose, x, v, g) for g in (f, f.at[0].add(1.0)))
+    np.testing.assert_array_equal(np.any(here.position != there.position, axis=1), np.arange(COUNT) == 0)
+
+
 def test_published_sizes():
     """Tables G and H by hand, with the head for opacity that only Eq. 8 has."""
     config = DeformerConfig(adaptive_stiffness=False, codes=0)
@@ -195,9 +198,20 @@ def test_a_code_changes_the_look_of_its_gaussian_and_no_motion(graph):
 
 
 def test_an_untrained_network_changes_next_to_nothing(graph):
-    params = deformer.init(CONFIG, graph, jax.random.key(0))
-    for leaf in jax.tree.leaves(deform(CONFIG, params, graph, *inputs(CONFIG, graph))):
+    config = dataclasses.replace(CONFIG, iterations=0)
+    params = deformer.init(config, graph, jax.random.key(0))
+    for leaf in jax.tree.leaves(deform(config, params, graph, *inputs(config, graph))):
         assert 0 < np.abs(leaf).max() < 0.05
+
+
+def test_a_change_of_colour_is_bounded_and_goes_both_ways(graph):
+    """By twice the published sigmoid less one."""
+    params, given = random_params(CONFIG, graph), inputs(CONFIG, graph)
+    head = params["network"]["heads"]["colors"]
+    linear = {**head, "bias": jnp.asarray([-3.0, 0.0, 3.0]), "kernel": jnp.zeros_like(head["kernel"])}
+    params["network"]["heads"]["colors"] = linear
+    expected = 2 / (1 + np.exp([3.0, 0.0, -3.0])) - 1
+    np.testing.assert_allclose(deform(CONFIG, params, graph, *given).colors[5], expected, atol=1e-6)
 
 
 def test_gradients_reach_every_parameter(graph):

@@ -32,9 +32,9 @@ class GraphConfig:
 class DeformerConfig:
     """The deformation network (SMAD 3.2, B.2, Tables G and H), and what of it an ablation switches off.
 
-    The first columns of Tables 2 and 4 come from the defaults by `velocities` (tau_v + 1: 0 is B0, 2 is B1),
-    `edge_features=False` (the vanilla GNN: messages of two hidden states alone), `adaptive_stiffness=False` (before
-    A2), `codes=0` (before A4), and `iterations=0`, with which no node hears of another.
+    Rows of Tables 2 and 4: `velocities` is tau_v + 1, so 0 is B0 and 2 is B1; `adaptive_stiffness=False` before A2,
+    `edge_features=False` before A3 (the vanilla GNN, whose messages are of two hidden states alone), `codes=0` before
+    A4; with `iterations=0` no node hears of another, which is the MLP deformer.
     """
 
     pose: int = 72  # ours: numbers of one body pose, as SMPL's 24 axis-angle joints have

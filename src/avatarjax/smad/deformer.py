@@ -40,7 +40,8 @@ class Deltas:
 
     position (n, 3), velocity (n, 3): three linear numbers each, in whatever the caller reads them as (offset or
     acceleration). log_scales (n, 3): of standard deviations, so half the paper's log-diagonal covariance. colors
-    (n, 3) in (-1, 1): 2 sigmoid - 1, since the printed sigmoid in (0, 1) could only brighten. logit_opacities (n,).
+    (n, 3) in (-1, 1): 2 sigmoid - 1, since Table H's sigmoid alone, in (0, 1), could only brighten; it is
+    (colors + 1) / 2. logit_opacities (n,).
     """
 
     position: Float[Array, "n 3"]
@@ -152,7 +153,8 @@ class Deformer(nnx.Module):
         motion = jax.nn.relu(narrow)
         look = motion if codes is None else jax.nn.relu(narrow + self.decode_code(codes))
         out = {k: self.heads[k](motion if k in ("position", "velocity") else look) for k in HEADS}
-        out["colors"] = 2 * jax.nn.sigmoid(out["colors"]) - 1
+        # 2 sigmoid(x) - 1, without losing the digits of small changes.
+        out["colors"] = jnp.tanh(out["colors"] / 2)
         return Deltas(**{**out, "logit_opacities": out["logit_opacities"][:, 0]})
 
 
