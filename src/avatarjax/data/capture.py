@@ -77,6 +77,7 @@ def film(
         np.asarray(motion.hips, np.float32),
         avatar.rig.names,
         avatar.rig.parents,
+        np.asarray(avatar.rig.heads, np.float32),
     )
     new = folder.with_name(f".{folder.name}.new")
     shutil.rmtree(new, ignore_errors=True)

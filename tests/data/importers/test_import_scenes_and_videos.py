@@ -136,7 +136,8 @@ def recording(frames=5, moving=False, width=48, height=32):
     turns = np.stack([np.stack(row, -1) for row in ((c, z, s), (z, o, z), (-s, z, c))], 1).astype(np.float32)
     rotations = np.stack([turns, np.tile(np.eye(3, dtype=np.float32), (frames, 1, 1))], 1)
     path = np.stack([z, o, angle], -1).astype(np.float32)
-    return images, masks, camera, Poses(rotations, turns, path, names=("hips", "spine"), parents=(-1, 0))
+    joints = np.array([[0.0, 1.0, 0.0], [0.0, 1.2, 0.0]], np.float32)
+    return images, masks, camera, Poses(rotations, turns, path, ("hips", "spine"), (-1, 0), joints)
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["one camera", "a camera a frame"])
@@ -154,6 +155,7 @@ def test_a_monocular_folder_round_trips(tmp_path, moving, as_video):
         np.testing.assert_allclose(loaded.camera_at(3).intrinsics.shape, (3, 3))
         np.testing.assert_array_equal(loaded.poses.rotations, poses.rotations)
         np.testing.assert_array_equal(loaded.poses.root_translation, poses.root_translation)
+        np.testing.assert_array_equal(loaded.poses.joints, poses.joints)
         assert loaded.poses.names == ("hips", "spine") and loaded.poses.parents == (-1, 0)
 
 

@@ -5,7 +5,7 @@ masks/0000.png ...                 foreground above 127
 cameras.json                       {"convention": "opencv", "width": w, "height": h,
                                     "cameras": [{"intrinsics": 3x3, "world_to_camera": 4x4}, ...]}: one, or one a frame
 poses.npz                          rotations (f, j, 3, 3), root_rotation (f, 3, 3), root_translation (f, 3);
-                                   optional names (j,) and parents (j,)
+                                   optional names (j,), parents (j,) and joints (j, 3) of the rest pose
 """
 
 from __future__ import annotations
@@ -109,6 +109,8 @@ def write_monocular(
             arrays["names"] = np.array(poses.names)
         if poses.parents is not None:
             arrays["parents"] = np.array(poses.parents, np.int32)
+        if poses.joints is not None:
+            arrays["joints"] = poses.joints
         np.savez(temporary / POSES, allow_pickle=False, **arrays)
         # What was written is read again: it must be a whole folder before it gets its name.
         for _ in load_monocular(temporary).frames():
@@ -239,6 +241,7 @@ def _read_poses(path: Path) -> Poses:
         *(arrays[name].astype(np.float32) for name in needed),
         names=tuple(str(name) for name in arrays["names"]) if "names" in arrays else None,
         parents=tuple(int(parent) for parent in arrays["parents"]) if "parents" in arrays else None,
+        joints=arrays["joints"].astype(np.float32) if "joints" in arrays else None,
     )
     check_poses(poses, path)
     return poses

@@ -19,7 +19,7 @@ from avatarjax.io import exr
 class Poses:
     """Poses over f frames in our axes and metres: rotations (f, j, 3, 3) of joints relative to their parents,
     root_rotation (f, 3, 3) and root_translation (f, 3) to the world; names (j,) and parents (j,), -1 for a root, or
-    None.
+    None; joints (j, 3): where they are in the rest pose, in which all rotations are the identity, or None.
     """
 
     rotations: Float[np.ndarray, "f j 3 3"]
@@ -27,6 +27,7 @@ class Poses:
     root_translation: Float[np.ndarray, "f 3"]
     names: tuple[str, ...] | None = None
     parents: tuple[int, ...] | None = None
+    joints: Float[np.ndarray, "j 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.rotations)
@@ -88,6 +89,8 @@ def check_poses(poses: Poses, path: Path) -> None:
     for name, values in (("names", poses.names), ("parents", poses.parents)):
         if values is not None and len(values) != shape[1]:
             raise ValueError(f"{path}: {len(values)} {name} for {shape[1]} joints")
+    if poses.joints is not None and (poses.joints.shape != (shape[1], 3) or not np.isfinite(poses.joints).all()):
+        raise ValueError(f"{path}: joints {poses.joints.shape} must be {shape[1]} finite points (x, y, z) in metres")
 
 
 def not_rotations(matrices: Float[np.ndarray, "*b 3 3"]) -> bool:
