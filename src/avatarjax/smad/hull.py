@@ -68,8 +68,7 @@ class Hull:
 def initialise(video: MonocularVideo, config: HullConfig = HullConfig()) -> Gaussians:
     """Canonical Gaussians (SMAD's G^c, Fig. 2) of the person in a video, in the body frame.
 
-    Raises ValueError where masks are empty, do not count as the poses or do not fit the camera, and where no voxel lies
-    in enough silhouettes.
+    Raises ValueError where masks are empty or do not fit the camera, and where no voxel lies in enough silhouettes.
     """
     chosen = views.spread(len(video), config.frames)
     cameras, masks = views.of_video(video, chosen), video.masks[chosen]

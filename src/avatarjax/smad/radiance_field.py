@@ -76,7 +76,7 @@ class FieldConfig:
 
 
 class Deformation(nnx.Module):
-    """Where points that are seen at a time lie in the canonical space, as an offset; nowhere else before training."""
+    """Where points that are seen at a time lie in the canonical space, as an offset, which is zero before training."""
 
     def __init__(self, config: FieldConfig, *, rngs: nnx.Rngs):
         width = config.width
@@ -157,7 +157,8 @@ def time_average(
 ) -> tuple[Float[Array, "x y z"], Float[Array, "x y z 3"]]:
     """The mean density over times in 0..1, (1 / T) sum sigma(x, t), per metre, and the colours it is seen in.
 
-    Colours are means weighed by density.
+    x is a point of the body frame: that of the canonical grid itself would be the same at all times. Colours are means
+    weighed by density.
     """
     slabs = grid.centres.reshape(grid.shape[0], -1, 3)
 

@@ -63,7 +63,7 @@ def lookup(grid: Grid, values: Array, points: Float[Array, "n 3"]) -> Array:
 
 def surface(occupied: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """Occupied voxels with an empty one behind a face; outside of the grid all is empty."""
-    return occupied & ~ndimage.binary_erosion(occupied)
+    return occupied & ~np.asarray(ndimage.binary_erosion(occupied), bool)
 
 
 def to_gaussians(

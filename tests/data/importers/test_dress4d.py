@@ -60,6 +60,16 @@ def test_a_take_is_a_monocular_video_of_one_camera(take, camera):
     np.testing.assert_array_equal(video.masks.sum((1, 2)), [5 * k for k in FRAMES])
 
 
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_an_opaque_alpha_channel_is_no_foreground(take, channels):
+    mask = np.zeros((HEIGHT, WIDTH, channels), np.uint8)
+    mask[3:7, 2:5] = 1
+    if channels in (2, 4):
+        mask[..., -1] = 255
+    exr.write_png(take / "Capture" / "0004" / "masks" / "mask-f00011.png", mask)
+    assert data.load_monocular(take).masks[0].sum() == 12
+
+
 def test_poses_are_of_the_pelvis_in_the_takes_own_world(take):
     poses = data.load_monocular(take).poses
     path = np.array([[0.1 * k - 0.002, 1.0 - 0.223, 0.028] for k in FRAMES])

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from avatarjax.cameras import Camera
 from avatarjax.io import exr
@@ -107,6 +107,13 @@ def read_sized(path: Path, camera: Camera) -> UInt8[np.ndarray, "h w c"]:
     if pixels.shape[:2] != (camera.height, camera.width):
         raise ValueError(f"{path} has shape {pixels.shape[:2]}, the first image {(camera.height, camera.width)}")
     return pixels
+
+
+def read_nonzero(path: Path, camera: Camera) -> Bool[np.ndarray, "h w"]:
+    """A mask in which this camera's foreground is all that is not black."""
+    pixels = read_sized(path, camera)
+    # An alpha channel, the second or the fourth, is opaque everywhere.
+    return (pixels[..., : 1 if pixels.shape[2] < 3 else 3] != 0).any(-1)
 
 
 def read_rgb(paths: Iterable[Path], camera: Camera) -> Iterator[UInt8[np.ndarray, "h w 3"]]:

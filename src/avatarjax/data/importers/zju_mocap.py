@@ -26,7 +26,7 @@ from jaxtyping import Float
 from avatarjax.cameras import Camera
 from avatarjax.data.importers import axes, series, smpl
 from avatarjax.data.importers.distortion import Undistortion
-from avatarjax.data.importers.recording import MonocularVideo, not_rotations, read_rgb, read_sized
+from avatarjax.data.importers.recording import MonocularVideo, not_rotations, read_nonzero, read_rgb
 from avatarjax.io import exr
 
 ANNOTATIONS = "annots.npy"
@@ -138,7 +138,7 @@ def _ours(
 
 
 def _read_mask(path: Path, view: Camera, lens: Undistortion | None) -> np.ndarray:
-    mask = (read_sized(path, view) != 0).any(-1)
+    mask = read_nonzero(path, view)
     return lens.mask(mask) if lens else mask
 
 
