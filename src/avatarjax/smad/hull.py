@@ -39,7 +39,7 @@ _FACING = 2
 class HullConfig:
     """box: where the body may be, metres in its frame, about the root; the grid then shrinks to what is there.
     resolution: voxels along its longest side. fraction: of the frames that see a voxel, those in whose silhouette it
-    must lie; the default is for a person who turns and else stands still, a dancer's legs need 0.7 and come out blurred.
+    must lie; the default is for a person who turns and else stands still; a dancer's legs need 0.7 and are blurred.
     frames: at most so many are used, spread evenly. gaussians: about so many come out, of this opacity."""
 
     box: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-1.0, -1.3, -1.0), (1.0, 1.3, 1.0))
