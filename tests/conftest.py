@@ -2,6 +2,7 @@
 
 import gc
 import os
+import tempfile
 from pathlib import Path
 
 import jaxtyping
@@ -15,7 +16,10 @@ import pytest  # noqa: E402
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 2)
-jax.config.update("jax_compilation_cache_dir", os.environ.get("AVATARJAX_TEST_CACHE") or None)
+# The same programs are compiled by many modules, and anew after their caches were cleared: a run keeps them on disk.
+_cache = tempfile.TemporaryDirectory(prefix="avatarjax-tests-", ignore_cleanup_errors=True)
+jax.config.update("jax_compilation_cache_dir", os.environ.get("AVATARJAX_TEST_CACHE") or _cache.name)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 @pytest.fixture
