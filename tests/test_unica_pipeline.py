@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import avatarjax as aj
+from avatarjax.train import StageConfig
 from avatarjax.unica import config as configs
-from avatarjax.unica.config import StageConfig
 from experiments import unica as experiment
 from experiments.tables import __main__ as tables
 from experiments.tables import figures, quality

@@ -13,9 +13,9 @@ from avatarjax import unica
 from avatarjax.data import dataset
 from avatarjax.data.dataset import Dataset
 from avatarjax.metrics.statistics import Estimate, bootstrap
+from avatarjax.train import Run
 from avatarjax.unica import evaluate, forecast
 from avatarjax.unica.baselines import train_feed_forward
-from avatarjax.unica.train import Run
 from experiments import pictures, unica_motion
 from experiments.tables.finished import Finished
 from experiments.tables.table import Notebook, Table, cell

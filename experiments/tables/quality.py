@@ -15,8 +15,8 @@ from avatarjax.data import avatars, dataset, skinning
 from avatarjax.io import weights
 from avatarjax.metrics import lpips, published
 from avatarjax.metrics.statistics import Estimate
+from avatarjax.train import Run
 from avatarjax.unica.baselines import pose_driven, rigging
-from avatarjax.unica.train import Run
 from experiments.tables.finished import Finished
 from experiments.tables.table import BETTER, Notebook, Table, ordering
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from avatarjax.posmap import pca
-from avatarjax.train import read_metrics
+from avatarjax.train import StageConfig, read_metrics
 from avatarjax.unica import batches, fit, train, train_appearance
-from avatarjax.unica.config import StageConfig
 
 
 @pytest.fixture(scope="module")

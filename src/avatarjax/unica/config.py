@@ -12,6 +12,7 @@ import typing
 from collections.abc import Callable
 
 from avatarjax.nets.point_transformer import PointTransformerConfig
+from avatarjax.train import StageConfig
 from avatarjax.unica.appearance import AppearanceConfig
 from avatarjax.unica.coefficients import CoefficientConfig
 from avatarjax.unica.denoiser import DenoiserConfig
@@ -22,16 +23,6 @@ from avatarjax.unica.vae import VAEConfig
 AppearanceName = typing.Literal["texels", "point_transformer"]
 DynamicsName = typing.Literal["coefficients", "unet"]
 PresetName = typing.Literal["ci", "small", "base", "paper"]
-
-
-@dataclasses.dataclass(frozen=True)
-class StageConfig:
-    """One training stage: number of steps, batch size, peak learning rate (linear warm-up, cosine decay to a tenth)."""
-
-    steps: int
-    batch: int
-    learning_rate: float
-    ema: float = 0.0  # ours; 0 keeps no average of the weights
 
 
 @dataclasses.dataclass(frozen=True)

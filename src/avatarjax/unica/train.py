@@ -7,12 +7,9 @@ would be compiled in as constants.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-import hashlib
 import typing
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,49 +18,16 @@ import numpy as np
 from avatarjax.data import sequences
 from avatarjax.data.dataset import Dataset
 from avatarjax.nets import functional
-from avatarjax.nets.functional import Params
 from avatarjax.posmap import pca as pcs
-from avatarjax.train import TrainState, fit, make_step, new_state, weights
-from avatarjax.train.state import Loss, optimiser
+from avatarjax.train import Run, train_stage
 from avatarjax.unica import batches, coefficients, latent, quarters
 from avatarjax.unica import fit as closed_form
 from avatarjax.unica.batches import Windows
 from avatarjax.unica.coefficients import CoefficientDenoiser, CoefficientDynamics, Context
-from avatarjax.unica.config import StageConfig, UnicaConfig
+from avatarjax.unica.config import UnicaConfig
 from avatarjax.unica.denoiser import Denoiser
 from avatarjax.unica.latent import LatentDynamics
 from avatarjax.unica.vae import VAE
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """Where a run keeps its checkpoints, its seed, and the fingerprint of its data."""
-
-    folder: Path
-    seed: int
-    data: str
-
-    def key(self, stage: str) -> jax.Array:
-        """The PRNG key of a stage: every stage has its own, whatever ran before it."""
-        return jax.random.fold_in(jax.random.key(self.seed), int(hashlib.sha256(stage.encode()).hexdigest()[:7], 16))
-
-
-def train_stage(
-    run: Run,
-    name: str,
-    stage: StageConfig,
-    settings: typing.Any,
-    loss: Loss,
-    initial: Params,
-    batch_at: Callable[[int], typing.Any],
-    hold: Callable[[Params, Params, typing.Any], Params] | None = None,
-) -> Params:
-    """Train one stage; `settings` is all of the configuration that its result depends on, beside the stage's own."""
-    transform = optimiser(stage.learning_rate, stage.steps)
-    state: TrainState = new_state(initial, transform, run.key(name), averaged=stage.ema > 0)
-    step = make_step(loss, transform, decay=stage.ema, hold=hold)
-    mark = hashlib.sha256(f"{run.data} {run.seed} {stage} {settings}".encode()).hexdigest()[:12]
-    return weights(fit(step, state, batch_at, stage.steps, run.folder, name, fingerprint=mark))
 
 
 def new_latent_dynamics(config: UnicaConfig, data: Dataset, run: Run) -> LatentDynamics:

@@ -16,10 +16,10 @@ from avatarjax.gaussians import Gaussians
 from avatarjax.metrics import lpips
 from avatarjax.nets import functional
 from avatarjax.nets.functional import Params
+from avatarjax.train import Run, train_stage
 from avatarjax.unica import appearance, batches, photometric, texel_head
 from avatarjax.unica.avatar import in_box
 from avatarjax.unica.config import StageConfig, UnicaConfig
-from avatarjax.unica.train import Run, train_stage
 
 # The base attributes that training changes.
 _LEARNED = ("log_scales", "quats", "logit_opacities", "colors")

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from avatarjax.train import Run, StageConfig
 from avatarjax.unica.baselines import pose_driven
-from avatarjax.unica.config import StageConfig, preset
-from avatarjax.unica.train import Run
+from avatarjax.unica.config import preset
 
 
 def test_the_rate_with_the_lowest_loss_gets_all_steps(tiny_data, upscaler, base, monkeypatch, tmp_path):

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from avatarjax.train import read_metrics
+from avatarjax.train import StageConfig, read_metrics
 from avatarjax.unica import train
 from avatarjax.unica.baselines import feed_forward, train_feed_forward
-from avatarjax.unica.config import StageConfig
 from tests.unica.baselines.conftest import SIZES
 
 

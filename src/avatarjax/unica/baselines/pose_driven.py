@@ -18,10 +18,9 @@ from avatarjax import posmap
 from avatarjax.data.dataset import Dataset
 from avatarjax.metrics import lpips
 from avatarjax.nets.functional import Params
-from avatarjax.train import read_metrics
+from avatarjax.train import Run, read_metrics
 from avatarjax.unica.appearance import BaseAttributes
 from avatarjax.unica.config import UnicaConfig
-from avatarjax.unica.train import Run
 from avatarjax.unica.train_appearance import train_texels
 
 RATES = (1.5e-3, 5e-3, 1.5e-2)

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 
 from avatarjax.data.dataset import Dataset
 from avatarjax.nets import functional
+from avatarjax.train import Run, train_stage
 from avatarjax.unica.baselines import feed_forward
 from avatarjax.unica.baselines.feed_forward import FeedForwardConfig, FeedForwardDynamics, Transformer
 from avatarjax.unica.config import UnicaConfig
-from avatarjax.unica.train import Run, frame_batches, group_batches, map_statistics, sample_groups, train_stage
+from avatarjax.unica.train import frame_batches, group_batches, map_statistics, sample_groups
 from avatarjax.unica.vae import VAE
 
 SAMPLED = 64  # groups on which codebook and statistics are based
