@@ -10,6 +10,8 @@ import dataclasses
 import typing
 from collections.abc import Callable
 
+from avatarjax.train import StageConfig
+
 Aggregation = typing.Literal["mean", "adjacency"]
 PresetName = typing.Literal["ci", "small", "base", "paper"]
 
@@ -79,11 +81,30 @@ class DeformerConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class DynamicsConfig:
+    """How the dynamics are learned from tracks. All but the weights of the losses is ours.
+
+    frames: length of the rollouts that are trained through. noise: of the offsets from which they start, in units of
+    the offsets' spread, constant over the history. target: weight of the error of what poses alone say. isometry and
+    damping: weights of Eq. 11, means over edges and nodes.
+    """
+
+    frames: int = 12
+    noise: float = 0.05
+    target: float = 0.5
+    isometry: float = 0.1
+    damping: float = 0.01
+    stage: StageConfig = StageConfig(2_000, 8, 1e-3)
+
+
+@dataclasses.dataclass(frozen=True)
 class SmadConfig:
     """A whole run."""
 
     graph: GraphConfig = GraphConfig()
     deformer: DeformerConfig = DeformerConfig()
+    dynamics: DynamicsConfig = DynamicsConfig()
+    dt: float = 1 / 30  # seconds a frame
 
 
 def _small() -> SmadConfig:

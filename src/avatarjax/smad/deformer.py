@@ -188,6 +188,11 @@ def init(config: DeformerConfig, graph: Graph, key: Key[Array, ""]) -> Params:
     return params
 
 
+def embed(config: DeformerConfig, params: Params, pose: Float[Array, "w p"]) -> Float[Array, "e"]:
+    """The embedding of a window of poses alone (Table G), as `deform` uses it."""
+    return functional.bind(Deformer, config, params["network"]).pose(pose)
+
+
 def deform(
     config: DeformerConfig,
     params: Params,

@@ -1,0 +1,199 @@
+"""How the nodes move: masses on springs and dampers, driven by poses, with a learned acceleration (SMAD 3.2).
+
+A node's place is that of the driven surface plus an offset o, both in the body frame. Offsets are masses on springs:
+
+    o'' = k_i (t_i - o_i) - g_i o'_i - sum_j k_ij ((o_i - t_i) - (o_j - t_j)) - m_i s''_i + f_i
+
+The spring k_i holds a node to the driven surface, k_ij to its neighbours, g_i damps, and m_i s'' is the inertia by
+which cloth lags behind a surface that accelerates in the world: all learned, so that what is rigid becomes stiff and
+what is loose soft (Eqs. 2 and 3, with the external force split into what drives). t is a target that a window of poses
+alone determines, and f what the deformation network adds. One explicit Euler step (Eq. 4) a frame; the constants are
+bounded so that the system without f is stable at any weights. The paper's springs are between nodes alone, and its
+network predicts all of the motion: such rollouts drifted or diverged in our prototype.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from avatarjax.nets.functional import Params
+from avatarjax.physics import mass_spring_damper as msd
+from avatarjax.physics.mass_spring_damper import Springs
+from avatarjax.smad import deformer, driving, skeletal
+from avatarjax.smad.config import SmadConfig
+from avatarjax.smad.driving import Pose
+from avatarjax.smad.graph import Graph
+from avatarjax.smad.skeletal import Skin
+
+# Numbers of a node beside its place and velocities: at rest, offset, way to the target, the surface's motion.
+NODE_FEATURES = 15
+
+# Bounds of k_i, of the sum of a node's k_ij, and of g_i, each per unit of mass, in SI units. At 30 frames a second
+# w^2 dt^2 + 2 g dt then stays below (1200 + 2 * 600) / 900 + 1 = 3.7, and Eq. 4 is stable below 4.
+ANCHOR, NEIGHBOUR, DAMPING = 1200.0, 600.0, 15.0
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class Scaling:
+    """What brings the network's inputs and outputs to unit size: mean and deviation (p,) of pose features, and typical
+    offsets, their velocities and accelerations, and accelerations of the driven surface, in SI units."""
+
+    pose_mean: Float[Array, "p"]
+    pose_scale: Float[Array, "p"]
+    offset: Float[Array, ""]
+    velocity: Float[Array, ""]
+    acceleration: Float[Array, ""]
+    drive: Float[Array, ""]
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class System:
+    """What dynamics are learned for: the graph, what drives its nodes, and scaling.
+
+    Without a skin (its joints are not known) the nodes' places at rest are the driven surface.
+    """
+
+    graph: Graph
+    skin: Skin | None
+    scaling: Scaling
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class State:
+    """offset (n, 3) of each node from the driven surface in the body frame, metres; velocities (n, v, 3) of it, newest
+    first, metres a second, v at least 1; driven (2, n, 3) the driven surface in the world, newest first; window (w, p)
+    normalised pose features, newest first; the last pose."""
+
+    offset: Float[Array, "n 3"]
+    velocities: Float[Array, "n v 3"]
+    driven: Float[Array, "2 n 3"]
+    window: Float[Array, "w p"]
+    pose: Pose
+
+
+def sized(config: SmadConfig, joints: int) -> SmadConfig:
+    """The configuration with a network of the right number of inputs for bodies of so many joints."""
+    network = dataclasses.replace(config.deformer, pose=driving.count(joints), node_features=NODE_FEATURES)
+    return dataclasses.replace(config, deformer=network)
+
+
+def init(config: SmadConfig, system: System, key: Key[Array, ""]) -> Params:
+    """Fresh parameters: a stiff, well damped system without inertia, a target and a network that add nothing."""
+    nodes, embedding = len(system.graph.positions), config.deformer.pose_embedding
+    return {
+        "deformer": deformer.init(config.deformer, system.graph, key),
+        "target": jnp.zeros((embedding, nodes, 3)),
+        "anchor": jnp.full((nodes,), -2.0, jnp.float32),
+        "neighbour": jnp.full((len(system.graph.edges),), -2.0, jnp.float32),
+        "damping": jnp.zeros(nodes),
+        "inertia": jnp.zeros(nodes),
+    }
+
+
+def springs(params: Params, graph: Graph) -> tuple[Springs, Float[Array, "n"]]:
+    """The system's springs between nodes, of unit masses and without offsets at rest, and k_i (n,) to the surface."""
+    i, j = graph.edges.T
+    # Shared out so that no node's springs sum to more than the bound.
+    share = NEIGHBOUR / jnp.maximum(graph.degree[i], graph.degree[j])
+    unit = jnp.ones(len(graph.positions))
+    between = Springs(
+        edges=graph.edges,
+        mask=jnp.ones(len(graph.edges), bool),
+        rest=jnp.zeros((len(graph.edges), 3)),
+        stiffness=share * jax.nn.sigmoid(params["neighbour"]),
+        mass=unit,
+        damping=DAMPING * jax.nn.sigmoid(params["damping"]),
+    )
+    return between, ANCHOR * jax.nn.sigmoid(params["anchor"])
+
+
+def driven(system: System, pose: Pose) -> Float[Array, "n 3"]:
+    """The surface that drives the nodes, in the body frame."""
+    return system.graph.positions if system.skin is None else skeletal.pose_points(system.skin, pose)
+
+
+def settled(config: SmadConfig, params: Params, window: Float[Array, "w p"]) -> Float[Array, "n 3"]:
+    """The offset that a window of poses alone determines: a linear reading of the network's own embedding of it."""
+    embedding = deformer.embed(config.deformer, params["deformer"], window)
+    return jnp.tensordot(embedding, params["target"], 1)
+
+
+def reset(config: SmadConfig, params: Params, system: System, pose: Pose) -> State:
+    """Standing still in a pose, the cloth where that pose alone would have it."""
+    surface = driving.to_world(pose, driven(system, pose))
+    features = _normalised(system, driving.features(pose, pose, config.dt))
+    window = jnp.repeat(features[None], config.deformer.pose_window, axis=0)
+    still = jnp.zeros((len(surface), max(config.deformer.velocities, 1), 3))
+    offset = settled(config, params, window)
+    return State(offset, still, jnp.stack([surface, surface]), window, pose)
+
+
+def step(config: SmadConfig, params: Params, system: System, state: State, pose: Pose) -> tuple[State, deformer.Deltas]:
+    """One frame: the state under the next pose, and what the network says of the Gaussians' look.
+
+    positions(...) of the new state are the nodes in the body frame of `pose`.
+    """
+    scaling, net = system.scaling, config.deformer
+    features = _normalised(system, driving.features(state.pose, pose, config.dt))
+    window = jnp.concatenate([features[None], state.window[:-1]])
+    surface = driven(system, pose)
+    world = driving.to_world(pose, surface)
+    # How the surface accelerates in the world, seen in the body frame: a second difference, which is late by a frame.
+    lurch = _turned(pose, world - 2 * state.driven[0] + state.driven[1]) / config.dt**2
+    sweep = _turned(pose, world - state.driven[0]) / config.dt
+    target = settled(config, params, window)
+
+    inputs = [system.graph.positions, state.offset / scaling.offset, (target - state.offset) / scaling.offset]
+    inputs += [sweep, lurch / scaling.drive]
+    deltas = deformer.deform(
+        net,
+        params["deformer"],
+        system.graph,
+        window,
+        surface + state.offset,
+        state.velocities[:, : net.velocities] / scaling.velocity,
+        jnp.concatenate(inputs, axis=1),
+    )
+    between, anchor = springs(params, system.graph)
+    force = -anchor[:, None] * (state.offset - target) - params["inertia"][:, None] * lurch
+    force = force + scaling.acceleration * deltas.position
+    velocity = state.velocities[:, 0]
+    acceleration = msd.acceleration(between, state.offset - target, velocity, force)
+    offset, velocity = msd.euler_step(state.offset, velocity, acceleration, config.dt)
+    velocities = jnp.concatenate([velocity[:, None], state.velocities[:, :-1]], axis=1)
+    return State(offset, velocities, jnp.stack([world, state.driven[0]]), window, pose), deltas
+
+
+def positions(system: System, state: State) -> Float[Array, "n 3"]:
+    """The nodes in the body frame of the state's pose, metres."""
+    return driving.to_body(state.pose, state.driven[0]) + state.offset
+
+
+def rollout(
+    config: SmadConfig, params: Params, system: System, state: State, poses: Pose
+) -> tuple[State, Float[Array, "t n 3"]]:
+    """`step` over t poses as one `lax.scan`: the last state, and the nodes in each pose's body frame."""
+
+    def advance(state, pose):
+        state, _ = step(config, params, system, state, pose)
+        return state, positions(system, state)
+
+    return jax.lax.scan(advance, state, poses)
+
+
+def _turned(pose: Pose, vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """World vectors in the body frame."""
+    return driving.to_body(pose.replace(root_translation=jnp.zeros(3)), vectors)
+
+
+def _normalised(system: System, features: Float[Array, "p"]) -> Float[Array, "p"]:
+    return (features - system.scaling.pose_mean) / system.scaling.pose_scale

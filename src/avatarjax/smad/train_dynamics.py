@@ -1,0 +1,192 @@
+"""Learning the dynamics from tracks: where nodes were in every frame of some takes (SMAD 3.2, Eqs. 9 and 11, B.3).
+
+Rollouts start in frames of the recording, a little wrong, and are trained through for some frames, so that the model
+learns to live with its own errors. Tracks come from the refined initialisation (`refine`), or from a mesh sequence.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Sequence
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from avatarjax.nets.functional import Params
+from avatarjax.smad import driving, dynamics
+from avatarjax.smad.config import SmadConfig
+from avatarjax.smad.driving import Pose
+from avatarjax.smad.dynamics import Scaling, State, System
+from avatarjax.smad.graph import Graph
+from avatarjax.smad.skeletal import Skin
+from avatarjax.train import Run, train_stage
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class Take:
+    """t frames: poses, and the nodes' positions (t, n, 3) in the body frame of each, metres."""
+
+    poses: Pose
+    positions: Float[Array, "t n 3"]
+
+
+@typing.no_type_check
+@flax.struct.dataclass
+class Recorded:
+    """All frames of some takes, one after the other, as training needs them: poses (f, ...), offsets (f, n, 3) from the
+    driven surface, that surface in the world (f, n, 3), normalised pose features (f, p), and the first frame (f,) of
+    the take that a frame belongs to."""
+
+    poses: Pose
+    offsets: Float[Array, "f n 3"]
+    driven: Float[Array, "f n 3"]
+    features: Float[Array, "f p"]
+    first: Int[Array, "f"]
+
+
+def fit_scaling(config: SmadConfig, graph: Graph, skin: Skin | None, takes: Sequence[Take]) -> System:
+    """The system with statistics of these takes, to be learned for. Raises ValueError without takes, for one of less
+    than three frames, and where positions are not one for each node."""
+    if not takes:
+        raise ValueError("no takes to learn dynamics from: give at least one")
+    for take in takes:
+        if len(take.positions) < 3 or take.positions.shape[1:] != graph.positions.shape:
+            raise ValueError(
+                f"positions {take.positions.shape} of a take must be of 3 frames or more and of "
+                f"{len(graph.positions)} nodes"
+            )
+    features = np.concatenate([np.asarray(driving.track(take.poses, config.dt)) for take in takes])
+    one = jnp.ones(())
+    deviation = features.std(axis=0)
+    # A joint that hardly moves in training must not shout where it moves more.
+    scaling = Scaling(jnp.asarray(features.mean(axis=0)), jnp.asarray(np.maximum(deviation, 0.05)), one, one, one, one)
+    system = System(graph, skin, scaling)
+    offsets, moved, lurched, drives = [], [], [], []
+    for take in takes:
+        surface = _surfaces(system, take.poses)
+        offset = np.asarray(take.positions) - np.asarray(driving.to_body(take.poses, surface))
+        offsets.append(offset)
+        moved.append(np.diff(offset, axis=0) / config.dt)
+        lurched.append(np.diff(offset, n=2, axis=0) / config.dt**2)
+        drives.append(np.diff(np.asarray(surface), n=2, axis=0) / config.dt**2)
+
+    def spread(values):
+        return jnp.asarray(max(1e-4, float(np.sqrt(np.mean(np.concatenate(values) ** 2)))), jnp.float32)
+
+    scaling = scaling.replace(
+        offset=spread(offsets), velocity=spread(moved), acceleration=spread(lurched), drive=spread(drives)
+    )
+    return system.replace(scaling=scaling)
+
+
+def record(config: SmadConfig, system: System, takes: Sequence[Take]) -> Recorded:
+    """The takes, ready to start rollouts from."""
+    parts, start = [], 0
+    for take in takes:
+        surface = _surfaces(system, take.poses)
+        features = driving.track(take.poses, config.dt) - system.scaling.pose_mean[None]
+        parts.append(
+            Recorded(
+                poses=take.poses,
+                offsets=take.positions - driving.to_body(take.poses, surface),
+                driven=surface,
+                features=features / system.scaling.pose_scale[None],
+                first=jnp.full(len(take.positions), start, jnp.int32),
+            )
+        )
+        start += len(take.positions)
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+
+def state_at(config: SmadConfig, recorded: Recorded, frame: Int[Array, ""]) -> State:
+    """The state that the recording was in; before a take began, it is taken to have stood still."""
+    count = max(config.deformer.velocities, 1)
+    back = jnp.maximum(frame - jnp.arange(max(count + 1, config.deformer.pose_window, 2)), recorded.first[frame])
+    offsets = recorded.offsets[back[: count + 1]]
+    return State(
+        offset=offsets[0],
+        velocities=jnp.swapaxes((offsets[:-1] - offsets[1:]) / config.dt, 0, 1),
+        driven=recorded.driven[back[:2]],
+        window=recorded.features[back[: config.deformer.pose_window]],
+        pose=jax.tree.map(lambda x: x[frame], recorded.poses),
+    )
+
+
+def losses(
+    config: SmadConfig, params: Params, system: System, offsets: Float[Array, "t n 3"], states: State
+) -> dict[str, Float[Array, ""]]:
+    """Terms of the loss of a rollout of t frames against recorded offsets: `data` and `target`, mean squared errors in
+    units of the offsets' spread; `isometry`, mean squared stretch of edges, and `damping`, mean squared velocity of
+    offsets (Eq. 11 as means), both in the same unit."""
+    unit = system.scaling.offset
+    i, j = system.graph.edges.T
+    rest = jnp.linalg.norm(system.graph.positions[i] - system.graph.positions[j], axis=-1)
+    targets = jax.vmap(lambda window: dynamics.settled(config, params, window))(states.window)
+
+    def stretch(state):
+        edge = jnp.take(dynamics.positions(system, state), i, axis=0) - dynamics.positions(system, state)[j]
+        return jnp.mean((jnp.linalg.norm(edge, axis=-1) - rest) ** 2)
+
+    return {
+        "data": jnp.mean((states.offset - offsets) ** 2) / unit**2,
+        "target": jnp.mean((targets - offsets) ** 2) / unit**2,
+        "isometry": jnp.mean(jax.vmap(stretch)(states)) / unit**2,
+        "damping": jnp.mean(states.velocities[:, :, 0] ** 2) / system.scaling.velocity**2,
+    }
+
+
+def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -> Params:
+    """Parameters of the dynamics, learned from takes (SMAD Eq. 9 with the tracks' error for the picture's)."""
+    recorded = record(config, system, takes)
+    settings = config.dynamics
+    first = np.asarray(recorded.first)
+    ends = np.append(np.flatnonzero(np.diff(first)) + 1, len(first))
+    last = ends[np.searchsorted(ends, np.arange(len(first)), side="right")]
+    frames = min(settings.frames, int(min(np.diff(np.append(0, ends)))) - 1)
+    starts = np.flatnonzero(np.arange(len(first)) + frames < last)
+
+    def batch_at(step):
+        rng = np.random.default_rng([run.seed, step])
+        return {"recorded": recorded, "system": system, "start": rng.choice(starts, settings.stage.batch)}
+
+    def loss(params, key, batch):
+        system, recorded = batch["system"], batch["recorded"]
+
+        def one(start, key):
+            state = state_at(config, recorded, start)
+            wrong = jax.random.normal(key, state.offset.shape)
+            state = state.replace(offset=state.offset + settings.noise * system.scaling.offset * wrong)
+            ahead = start + 1 + jnp.arange(frames)
+            poses = jax.tree.map(lambda x: x[ahead], recorded.poses)
+
+            def advance(state, pose):
+                state, _ = dynamics.step(config, params, system, state, pose)
+                return state, state
+
+            _, states = jax.lax.scan(advance, state, poses)
+            return losses(config, params, system, recorded.offsets[ahead], states)
+
+        found = jax.vmap(one)(batch["start"], jax.random.split(key, len(batch["start"])))
+        found = {name: jnp.mean(values) for name, values in found.items()}
+        weights = {"data": 1.0, "target": settings.target, "isometry": settings.isometry, "damping": settings.damping}
+        return sum(weights[name] * value for name, value in found.items()), found
+
+    initial = dynamics.init(config, system, run.key("dynamics"))
+    return train_stage(run, "dynamics", settings.stage, config, loss, initial, batch_at)
+
+
+def replay(config: SmadConfig, params: Params, system: System, take: Take, start: int) -> Float[Array, "t n 3"]:
+    """A rollout over the rest of a take from the state that it was in at a frame: positions (t, n, 3) in the body
+    frames of the frames after it."""
+    state = state_at(config, record(config, system, [take]), jnp.asarray(start))
+    poses = jax.tree.map(lambda x: x[start + 1 :], take.poses)
+    return dynamics.rollout(config, params, system, state, poses)[1]
+
+
+def _surfaces(system: System, poses: Pose) -> Float[Array, "t n 3"]:
+    """The driven surface in the world in every pose."""
+    return jax.lax.map(lambda pose: driving.to_world(pose, dynamics.driven(system, pose)), poses)

@@ -1,0 +1,130 @@
+"""Learning dynamics from tracks: starting states, losses, and a pendulum-like cloth that is learned."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from avatarjax import rotations
+from avatarjax.smad import config as configs
+from avatarjax.smad import driving, dynamics, graph, train_dynamics
+from avatarjax.smad.config import DynamicsConfig
+from avatarjax.smad.driving import Pose
+from avatarjax.smad.train_dynamics import Take
+from avatarjax.train import Run, StageConfig
+
+BASE = dynamics.sized(configs.preset("ci"), 1)
+CONFIG = dataclasses.replace(
+    BASE,
+    deformer=dataclasses.replace(BASE.deformer, hidden=16, message=8, decoder=(16, 8), pose_width=16),
+    dynamics=DynamicsConfig(frames=8, stage=StageConfig(150, 8, 2e-2)),
+)
+POINTS = np.random.default_rng(0).normal(size=(16, 3)) * 0.3
+FREQUENCY, DAMPING = 9.0, 4.0
+
+
+def swinging(seed, frames=70):
+    """A root that is pushed about, and nodes of which the lower hang on springs in the world."""
+    rng = np.random.default_rng(seed)
+    pushes = np.repeat(rng.normal(size=(frames // 7 + 1, 3)) * [4, 0, 4], 7, axis=0)[:frames]
+    velocity = np.cumsum(pushes * CONFIG.dt, axis=0)
+    path = np.cumsum((velocity - velocity.mean(0)) * CONFIG.dt, axis=0)
+    turn = np.asarray(rotations.yaw_matrix(jnp.asarray(0.5)))
+    loose = np.clip(-2 * POINTS[:, 1:2], 0, 1)
+    offset, speed, offsets = np.zeros((16, 3)), np.zeros((16, 3)), []
+    before = np.concatenate([path[:1], path[:1], path])
+    for k in range(frames):
+        lurch = (before[k + 2] - 2 * before[k + 1] + before[k]) / CONFIG.dt**2
+        speed = speed + CONFIG.dt * (-loose * lurch @ turn - FREQUENCY**2 * offset - DAMPING * speed)
+        offset = offset + CONFIG.dt * speed
+        offsets.append(offset)
+    poses = Pose(
+        jnp.tile(jnp.eye(3), (frames, 1, 1, 1)),
+        jnp.tile(jnp.asarray(turn), (frames, 1, 1)),
+        jnp.asarray(path, jnp.float32),
+    )
+    return Take(poses, jnp.asarray(POINTS + np.stack(offsets), jnp.float32))
+
+
+@pytest.fixture(scope="module")
+def takes():
+    return [swinging(0), swinging(1, 40), swinging(2)]
+
+
+@pytest.fixture(scope="module")
+def system(takes):
+    return train_dynamics.fit_scaling(CONFIG, graph.build(POINTS, 4), None, takes)
+
+
+@pytest.fixture(scope="module")
+def trained(system, takes, tmp_path_factory):
+    return train_dynamics.train(CONFIG, system, takes, Run(tmp_path_factory.mktemp("run"), 0, "swinging"))
+
+
+def test_a_state_is_what_the_recording_says(system, takes):
+    recorded = train_dynamics.record(CONFIG, system, takes)
+    frame = 70 + 25
+    state = train_dynamics.state_at(CONFIG, recorded, jnp.asarray(frame))
+    np.testing.assert_allclose(dynamics.positions(system, state), takes[1].positions[25], atol=1e-5)
+    steps = np.diff(np.asarray(takes[1].positions[:26]), axis=0)[::-1] / CONFIG.dt
+    np.testing.assert_allclose(np.moveaxis(np.asarray(state.velocities), 1, 0)[:12], steps[:12], atol=2e-3)
+    np.testing.assert_allclose(
+        state.driven[1],
+        driving.to_world(jax.tree.map(lambda x: x[24], takes[1].poses), jnp.asarray(POINTS, jnp.float32)),
+        atol=1e-5,
+    )
+
+
+def test_a_state_knows_nothing_of_the_take_before(system, takes):
+    recorded = train_dynamics.record(CONFIG, system, takes)
+    state = train_dynamics.state_at(CONFIG, recorded, jnp.asarray(70))
+    np.testing.assert_array_equal(state.velocities, 0.0)
+    np.testing.assert_array_equal(state.driven[0], state.driven[1])
+    np.testing.assert_array_equal(state.window, np.broadcast_to(state.window[0], state.window.shape))
+
+
+def test_the_terms_of_the_loss_are_as_printed(system):
+    params = dynamics.init(CONFIG, system, jax.random.key(0))
+    poses = jax.tree.map(lambda x: x[:2], swinging(0).poses)
+    still = [dynamics.reset(CONFIG, params, system, jax.tree.map(lambda x, k=k: x[k], poses)) for k in range(2)]
+    states = jax.tree.map(lambda *x: jnp.stack(x), *still)
+    velocities = jnp.zeros_like(states.velocities).at[:, :, 0].set(0.3)
+    stretched = states.replace(offset=0.1 * jnp.asarray(POINTS, jnp.float32)[None].repeat(2, 0), velocities=velocities)
+    found = train_dynamics.losses(CONFIG, params, system, jnp.zeros((2, 16, 3)), stretched)
+    i, j = np.asarray(system.graph.edges).T
+    lengths = np.linalg.norm(POINTS[i] - POINTS[j], axis=1)
+    unit = float(system.scaling.offset)
+    np.testing.assert_allclose(found["data"], np.mean((0.1 * POINTS) ** 2) / unit**2, rtol=1e-4)
+    np.testing.assert_allclose(found["isometry"], np.mean((0.1 * lengths) ** 2) / unit**2, rtol=1e-3)
+    np.testing.assert_allclose(found["damping"], 0.09 / float(system.scaling.velocity) ** 2, rtol=1e-4)
+    np.testing.assert_allclose(found["target"], 0.0, atol=1e-8)
+
+
+def test_swinging_is_learned_better_than_holding_still(system, trained):
+    unseen = swinging(7)
+    found = train_dynamics.replay(CONFIG, trained, system, unseen, 0)
+    truth = np.asarray(unseen.positions[1:])
+    error = np.sqrt(np.mean((np.asarray(found) - truth) ** 2))
+    still = np.sqrt(np.mean((truth - POINTS) ** 2))
+    assert error < 0.6 * still
+
+
+def test_what_hangs_loose_has_learned_inertia(system, trained):
+    loose, stiff = POINTS[:, 1] < -0.3, POINTS[:, 1] > 0.1
+    inertia = np.asarray(trained["inertia"])
+    assert inertia[loose].mean() > 3 * np.abs(inertia[stiff]).mean()
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        (lambda takes: [], "no takes"),
+        (lambda takes: [takes[0].replace(positions=takes[0].positions[:, :5])], "16 nodes"),
+        (lambda takes: [jax.tree.map(lambda x: x[:2], takes[0])], "3 frames"),
+    ],
+)
+def test_wrong_takes_are_refused(takes, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        train_dynamics.fit_scaling(CONFIG, graph.build(POINTS, 4), None, wrong(takes))
