@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from avatarjax import rotations
+from avatarjax.data.body import Rig
 from avatarjax.gaussians import Gaussians
+from avatarjax.io import weights
 from avatarjax.smad import avatar as smad
 from avatarjax.smad import config as configs
-from avatarjax.smad import dynamics, embedded, graph
+from avatarjax.smad import dynamics, embedded, files, graph, skeletal
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.dynamics import Scaling, System
 from tests.parameters import random_like
@@ -79,6 +81,32 @@ def test_states_of_one_avatar_can_be_batched(avatar, rolled):
     _, frames = jax.jit(jax.vmap(lambda s: smad.rollout(avatar, s, poses, gaussians=False)))(both)
     assert frames.gaussians is None
     np.testing.assert_allclose(frames.nodes[1], rolled[1].nodes, atol=1e-5)
+
+
+def test_a_file_keeps_the_avatar(avatar, tmp_path):
+    poses, names, parents = motion(1), ("hips", "spine"), (-1, 0)
+    rig = Rig(jnp.array([[0.0, 1.0, 0.0], [0.0, 1.2, 0.0]]), jnp.zeros((2, 3)), jnp.zeros((2, 0, 3)), names, parents)
+    skinned = avatar.system.replace(skin=skeletal.bind(rig, at(poses, 0), avatar.system.graph.positions))
+    for whole in (avatar, avatar.replace(system=skinned)):
+        files.save(tmp_path / "avatar.safetensors", whole)
+        again = files.load(tmp_path)
+        assert again.config == CONFIG
+        assert jax.tree.structure(again) == jax.tree.structure(whole)
+        jax.tree.map(np.testing.assert_array_equal, again, whole)
+
+
+def test_a_file_that_is_none_is_refused(avatar, tmp_path):
+    with pytest.raises(ValueError, match=r"experiments\.smad --avatar nobody"):
+        files.load("nobody", runs=tmp_path)
+    path = tmp_path / "avatar.safetensors"
+    weights.save_tree(path, {"a": np.zeros(1)})
+    with pytest.raises(ValueError, match="no SMAD avatar of version 1"):
+        files.load(path)
+    files.save(path, avatar)
+    arrays, metadata = weights.load_arrays(path)
+    weights.save_tree(path, weights.nest({k: v for k, v in arrays.items() if "binding" not in k}), **metadata)
+    with pytest.raises(ValueError, match="lacks parts"):
+        files.load(path)
 
 
 def test_a_pose_of_another_body_is_refused(avatar):

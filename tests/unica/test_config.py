@@ -3,8 +3,9 @@ import json
 
 import pytest
 
+from avatarjax.io import weights
 from avatarjax.nets import functional
-from avatarjax.unica import PRESETS, UnicaConfig, files, preset
+from avatarjax.unica import PRESETS, UnicaConfig, preset
 from avatarjax.unica.appearance import AppearanceNetwork
 from avatarjax.unica.denoiser import Denoiser
 from avatarjax.unica.vae import VAE
@@ -18,7 +19,7 @@ def test_every_preset_can_be_made_and_is_hashable(name):
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_config_survives_json(name):
     config = preset(name)
-    assert files.from_dict(UnicaConfig, json.loads(json.dumps(dataclasses.asdict(config)))) == config
+    assert weights.from_dict(UnicaConfig, json.loads(json.dumps(dataclasses.asdict(config)))) == config
 
 
 def test_fields_of_a_preset_can_be_replaced():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import typing
@@ -89,6 +90,19 @@ def nest(arrays: dict[str, typing.Any]) -> dict[str | int, typing.Any]:
             node = node.setdefault(part, {})
         node[last] = value
     return tree
+
+
+def from_dict(cls: type, values: dict[str, typing.Any]) -> typing.Any:
+    """A (nested) config dataclass from the JSON form of `dataclasses.asdict`."""
+    hints = typing.get_type_hints(cls)
+    fields = {}
+    for name, value in values.items():
+        if dataclasses.is_dataclass(hints[name]):
+            value = from_dict(hints[name], value)
+        elif isinstance(value, list):
+            value = tuple(value)
+        fields[name] = value
+    return cls(**fields)
 
 
 def _is_key(leaf: typing.Any) -> bool:

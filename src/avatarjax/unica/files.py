@@ -89,7 +89,7 @@ def _read(path: Path) -> Avatar:
     if metadata.get("version") != VERSION:
         raise ValueError(f"{path} holds no avatar of version {VERSION}: train it again, with --train")
     try:
-        config = from_dict(UnicaConfig, metadata["config"])
+        config = weights.from_dict(UnicaConfig, metadata["config"])
         arrays = {k: v.astype(np.float32) if v.dtype == np.float16 else v for k, v in arrays.items()}
         tree = weights.nest({name: jnp.asarray(value) for name, value in arrays.items()})
         dynamics = tree["dynamics"]
@@ -113,16 +113,3 @@ def _read(path: Path) -> Avatar:
         )
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} lacks parts of an avatar ({error}): train it again") from error
-
-
-def from_dict(cls: type, values: dict[str, typing.Any]) -> typing.Any:
-    """A (nested) config dataclass from the JSON form of `dataclasses.asdict`."""
-    hints = typing.get_type_hints(cls)
-    fields = {}
-    for name, value in values.items():
-        if dataclasses.is_dataclass(hints[name]):
-            value = from_dict(hints[name], value)
-        elif isinstance(value, list):
-            value = tuple(value)
-        fields[name] = value
-    return cls(**fields)
