@@ -99,10 +99,13 @@ def from_dict(cls: type, values: dict[str, typing.Any]) -> typing.Any:
     for name, value in values.items():
         if dataclasses.is_dataclass(hints[name]):
             value = from_dict(hints[name], value)
-        elif isinstance(value, list):
-            value = tuple(value)
-        fields[name] = value
+        fields[name] = _tuples(value)
     return cls(**fields)
+
+
+def _tuples(value: typing.Any) -> typing.Any:
+    """Lists, which JSON makes of tuples, as tuples again."""
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 def _is_key(leaf: typing.Any) -> bool:

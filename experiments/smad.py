@@ -1,0 +1,224 @@
+"""Learn an avatar whose clothes swing from videos of one camera, animate it with poses, and report: SMAD end to end.
+
+    python -m experiments.smad --avatar ghostlady                 # preset small, the default on a CPU
+    python -m experiments.smad --avatar ghostlady --preset ci     # the same at the smallest sizes, in minutes
+    python -m experiments.smad --videos my_turn my_walk --test my_dance    # your own takes (docs/data_import.md)
+    python -m experiments.smad --avatar ghostlady --stage dynamics         # one stage anew
+
+Stages in order: film, hull, refine, dynamics, report. The first take shows the person turning slowly before the camera.
+Results lie in OUT/smad/AVATAR/PRESET/; open report.html there. A second run reuses what is finished, an interrupted one
+goes on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import shutil
+import time
+import typing
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from avatarjax import smad
+from avatarjax.data import MonocularVideo, avatars, capture, load_monocular
+from avatarjax.data.motion import performances
+from avatarjax.gaussians import Gaussians
+from avatarjax.io import atomic
+from avatarjax.physics.xpbd import XPBDConfig
+from avatarjax.smad import dynamics, embedded, files, footage, graph, hull, refine, skeletal, train_dynamics
+from avatarjax.smad.config import SmadConfig
+from avatarjax.smad.refine import Refined
+from avatarjax.smad.train_dynamics import Take
+from avatarjax.train import Run
+from experiments import command_line, smad_report
+from experiments.smad_measures import poses_of
+
+STAGES = ("film", "hull", "refine", "dynamics", "report")
+
+
+@dataclasses.dataclass
+class Args:
+    """Learn an avatar with swinging clothes from monocular videos and report how it moves."""
+
+    avatar: str = "ghostlady"
+    """Which avatar to film: monk, cowgirl, survival, berserker or ghostlady."""
+    videos: tuple[Path, ...] = ()
+    """Learn from your own takes instead: folders that avatarjax.data.load_monocular reads, the slow turn first."""
+    test: tuple[Path, ...] = ()
+    """Takes of the same person to measure on, with --videos."""
+    preset: str = ""
+    """Sizes: ci, small, base or paper. Without it, small on a CPU and base on an accelerator."""
+    stage: str = "all"
+    """Run only this stage, anew; stages before it are reused, or run where they are missing."""
+    resume: bool = True
+    """Go on from checkpoints. --no-resume deletes this run's results first."""
+    seed: int = 0
+    """Seed of training; results of seeds other than 0 go to a folder PRESET-seedN."""
+    out: Path = Path("runs")
+    """Folder under which results go, as OUT/smad/AVATAR/PRESET/."""
+
+
+@dataclasses.dataclass
+class Experiment:
+    """One run: its arguments, configuration and folder, and how long its stages took."""
+
+    args: Args
+    config: SmadConfig
+    folder: Path
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+
+
+def run_experiment(args: Args) -> Path:
+    """Run the stages that `args` ask for; returns the folder of the results."""
+    experiment = prepare(args)
+    folder, config = experiment.folder, experiment.config
+    last = STAGES.index("report" if args.stage == "all" else args.stage)
+    began = time.monotonic()
+
+    def stage(name: str, text: str, work: Callable[[], typing.Any]) -> typing.Any:
+        print(f"[{time.monotonic() - began:6.1f} s] {name}: {text}", flush=True)
+        return timed(experiment, name, work)
+
+    print(f"avatar {args.avatar}, preset {args.preset}, into {folder}")
+    takes = stage("film", "takes to learn from and to measure on", lambda: film(experiment))
+    if last == 0:
+        return folder
+    start = stage("hull", "the first take's silhouettes", lambda: hull.initialise(takes["train"][0], config.hull))
+    if last == 1:
+        return folder
+    run = Run(folder / "checkpoints", args.seed, fingerprint(takes["train"]))
+    refined = stage("refine", "Gaussians and tracks", lambda: refined_gaussians(config, takes["train"], start, run))
+    if last == 2:
+        return folder
+    avatar, tracks = stage("dynamics", "training", lambda: learn(config, takes["train"], refined, run))
+    files.save(folder / files.FILE, avatar)
+    if last == len(STAGES) - 1:
+        stage("report", "measuring on other takes", lambda: smad_report.write(experiment, avatar, takes, tracks))
+        print(f"[{time.monotonic() - began:6.1f} s] report: open {folder / 'report.html'}")
+    return folder
+
+
+def prepare(args: Args) -> Experiment:
+    """Check the arguments and make the run's folder; ValueError says what is wrong and what there is."""
+    if args.videos:
+        args.avatar = args.videos[0].stem
+    elif args.test:
+        raise ValueError("--test needs --videos: takes of an avatar of ours are chosen by the preset")
+    elif args.avatar not in avatars.names():
+        raise ValueError(f"unknown avatar {args.avatar!r}: choose one of {', '.join(avatars.names())}")
+    if args.stage not in ("all", *STAGES):
+        raise ValueError(f"unknown stage {args.stage!r}: choose one of all, {', '.join(STAGES)}")
+    args.preset = args.preset or ("small" if jax.default_backend() == "cpu" else "base")
+    config = smad.preset(args.preset)
+    name = args.preset if args.seed == 0 else f"{args.preset}-seed{args.seed}"
+    experiment = Experiment(args, config, args.out / "smad" / args.avatar / name)
+    if not args.resume and experiment.folder.exists():
+        print(f"deleting the earlier results in {experiment.folder}")
+        shutil.rmtree(experiment.folder)
+    (experiment.folder / "checkpoints").mkdir(parents=True, exist_ok=True)
+    if args.stage == "film":
+        shutil.rmtree(experiment.folder / "film", ignore_errors=True)
+    for path in (experiment.folder / "checkpoints").glob(f"{args.stage}.*"):
+        path.unlink()
+    atomic.write_text(experiment.folder / "config.json", json.dumps(dataclasses.asdict(config), indent=2))
+    return experiment
+
+
+def film(experiment: Experiment) -> dict[str, list[MonocularVideo]]:
+    """The takes of each part, `train`, `test` and `unseen`: filmed where they are not there yet, or the user's own."""
+    args, wanted = experiment.args, experiment.config.film
+    if args.videos:
+        return {
+            "train": [load_monocular(path).held() for path in args.videos],
+            "test": [load_monocular(path).held() for path in args.test],
+        }
+    avatar = None
+    takes: dict[str, list[MonocularVideo]] = {}
+    for part in ("train", "test", "unseen"):
+        takes[part] = []
+        for name, seed in getattr(wanted, part):
+            folder = experiment.folder / "film" / f"{name}-{seed}"
+            if not (folder / capture.MESHES).is_file():
+                avatar = avatar or avatars.build(args.avatar)
+                motion = jax.device_get(performances.perform(avatar.rig, name, seed))
+                with tqdm(total=2 * len(motion.headings), desc=folder.name, unit="frame") as bar:
+                    config = XPBDConfig(substeps=wanted.substeps)
+                    capture.film(folder, avatar, motion, size=wanted.size, config=config, progress=bar.update)
+            takes[part].append(load_monocular(folder).held())
+    return takes
+
+
+def fingerprint(takes: Sequence[MonocularVideo]) -> str:
+    """What tells these takes from others."""
+    mark = hashlib.sha256()
+    for take in takes:
+        mark.update(np.ascontiguousarray(take.masks))
+        mark.update(np.ascontiguousarray(take.poses.rotations))
+        mark.update(np.ascontiguousarray(take.images()[::10]))
+    return mark.hexdigest()[:12]
+
+
+def refined_gaussians(
+    config: SmadConfig, takes: Sequence[MonocularVideo], start: Gaussians, run: Run
+) -> tuple[Refined, footage.Footage]:
+    """Canonical Gaussians and their tracks, fitted to the takes by splatting."""
+    shots = footage.gather(takes)
+    fitted = refine.refine(shots, start, shots.pose(0, 0), config.refine, run.folder, run.key("refine"))
+    return fitted, shots
+
+
+def learn(
+    config: SmadConfig, takes: Sequence[MonocularVideo], refined: tuple[Refined, footage.Footage], run: Run
+) -> tuple[smad.Avatar, list[Take]]:
+    """The avatar with dynamics that were learned from the tracks of its Gaussians, and these, pooled to nodes."""
+    fitted, shots = refined
+    means = np.asarray(fitted.gaussians.means)
+    # Of the Gaussians in a voxel the most opaque is kept: no picture tells which of them is wrong.
+    wanted = min(config.graph.nodes, len(means))
+    nodes = graph.downsample(
+        means, -np.asarray(fitted.gaussians.logit_opacities, np.float64), graph.edge_for_count(means, wanted)
+    )
+    net = graph.build(nodes.positions, config.graph.neighbours, config.graph.bandwidth)
+    share = 1 / np.bincount(nodes.node)
+
+    def pooled(track):
+        summed = jnp.zeros((len(track), len(nodes.positions), 3)).at[:, nodes.node].add(track)
+        return summed * jnp.asarray(share, jnp.float32)[None, :, None]
+
+    config = dynamics.sized(config, takes[0].poses.rotations.shape[1])
+    skin = None
+    if shots.rig is not None:
+        skin = skeletal.bind(shots.rig, shots.pose(0, 0), net.positions)
+    tracks = [Take(poses_of(take), pooled(refine.tracks(fitted, k))) for k, take in enumerate(takes)]
+    system = train_dynamics.fit_scaling(config, net, skin, tracks)
+    params = train_dynamics.train(config, system, tracks, run)
+    return smad.Avatar(fitted.gaussians, embedded.bind(fitted.gaussians, net), system, params, config), tracks
+
+
+def timed(experiment: Experiment, stage: str, work: Callable[[], typing.Any]) -> typing.Any:
+    """Do the work of a stage and keep how long it took."""
+    began = time.monotonic()
+    result = jax.block_until_ready(work())
+    path = experiment.folder / "seconds.json"
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    # A stage that was only read back took its time in an earlier run.
+    taken = round(time.monotonic() - began, 1)
+    experiment.seconds = {**known, stage: max(taken, known.get(stage, 0.0))}
+    atomic.write_text(path, json.dumps(experiment.seconds, indent=2))
+    return result
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line; returns the exit status."""
+    return command_line.run(run_experiment, Args, "experiments.smad", __doc__, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,164 @@
+"""What a SMAD avatar does on takes: pictures of it and of baselines beside the recording, and errors of its nodes."""
+
+from __future__ import annotations
+
+import functools
+import typing
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from avatarjax import smad
+from avatarjax.cameras import Camera
+from avatarjax.data import MonocularVideo, capture
+from avatarjax.gaussians import Gaussians
+from avatarjax.io import weights
+from avatarjax.metrics import image, lpips
+from avatarjax.metrics.statistics import Estimate, bootstrap
+from avatarjax.smad import driving, dynamics
+from avatarjax.smad.avatar import wear
+from avatarjax.smad.driving import Pose
+from avatarjax.smad.train_dynamics import Take
+from avatarjax.splat import SplatConfig, render, required_capacity
+
+EVERY = 5  # one frame of so many is drawn and measured
+SETTLE = 15  # frames after the start that no measure counts: the recording does not begin at rest
+LOOSE = 0.3  # the share of nodes that are furthest from skinning in training
+
+
+class Moved(typing.NamedTuple):
+    """What a method makes of a take: world Gaussians and nodes (t, n, 3) in the body frames of frames 1 to t."""
+
+    gaussians: typing.Callable[[int], Gaussians]
+    nodes: Float[np.ndarray, "t n 3"]
+
+
+def move(avatar: smad.Avatar, poses: Pose) -> dict[str, Moved]:
+    """All methods on the poses of a take."""
+    after = jax.tree.map(lambda x: x[1:], poses)
+    state = smad.reset(avatar, jax.tree.map(lambda x: x[0], poses))
+    _, frames = _rollout(avatar, state, after)
+    driven, settled = _without_dynamics(avatar, poses)
+    found = {"ours": Moved(lambda k: jax.tree.map(lambda x: x[k - 1], frames.gaussians), np.asarray(frames.nodes))}
+    for name, nodes in (("pose window alone", settled[1:]), ("skinning", driven[1:])):
+        dressed = functools.partial(_dressed, avatar, nodes, after)
+        found[name] = Moved(dressed, np.asarray(nodes))
+    return found
+
+
+def follow(avatar: smad.Avatar, take: Take) -> Moved:
+    """The avatar on the nodes of a track."""
+    after = jax.tree.map(lambda x: x[1:], take)
+    return Moved(functools.partial(_dressed, avatar, after.positions, after.poses), np.asarray(after.positions))
+
+
+def poses_of(take: MonocularVideo) -> Pose:
+    """The poses of all frames of a take."""
+    parts = take.poses.rotations, take.poses.root_rotation, take.poses.root_translation
+    return Pose(*(jnp.asarray(part, jnp.float32) for part in parts))
+
+
+def picture_errors(
+    take: MonocularVideo, moved: dict[str, Moved], perceptual: lpips.Network | None
+) -> dict[str, dict[str, Estimate]]:
+    """PSNR of the whole picture over black and inside the mask, SSIM and LPIPS of each method, over measured frames."""
+    values: dict[str, dict[str, list[float]]] = {name: {} for name in moved}
+    for frame in range(SETTLE, len(take), EVERY):
+        truth, inside = over_black(take, frame)
+        for name, method in moved.items():
+            drawn = jnp.clip(draw(method.gaussians(frame), take.camera_at(frame)), 0, 1)
+            mask = jnp.asarray(inside[..., None], jnp.float32)
+            # Zeros outside of the mask differ by nothing: the mean over it is larger by its share of the picture.
+            masked = image.psnr(drawn * mask, truth * mask) + 10 * jnp.log10(jnp.mean(mask))
+            found = {"PSNR": image.psnr(drawn, truth), "PSNR in the mask": masked, "SSIM": image.ssim(drawn, truth)}
+            if perceptual is not None:
+                found["LPIPS"] = lpips.distance(perceptual, drawn, truth)
+            for what, value in found.items():
+                values[name].setdefault(what, []).append(float(value))
+    return {name: {what: bootstrap(found) for what, found in kinds.items()} for name, kinds in values.items()}
+
+
+def over_black(take: MonocularVideo, frame: int) -> tuple[jax.Array, Bool[np.ndarray, "h w"]]:
+    """A recorded picture (h, w, 3) in 0..1 with what is not the person black, and the mask."""
+    inside = take.masks[frame]
+    return jnp.asarray(take.images()[frame] / 255 * inside[..., None], jnp.float32), inside
+
+
+def draw(gaussians: Gaussians, camera: Camera) -> jax.Array:
+    """A cloud over black (h, w, 3)."""
+    return _draw(gaussians, camera, SplatConfig(capacity=2 * required_capacity(gaussians, camera), depth=False))
+
+
+def true_nodes(avatar: smad.Avatar, canonical: MonocularVideo, take: MonocularVideo) -> np.ndarray | None:
+    """Where the vertices nearest to the nodes in the canonical pose are in a take (t, n, 3), in its body frames; None
+    for takes of which no meshes are known."""
+    found = [_vertices(video) for video in (canonical, take)]
+    if found[0] is None or found[1] is None:
+        return None
+    _, nearest = cKDTree(found[0][0]).query(np.asarray(avatar.system.graph.positions))
+    return found[1][:, nearest]
+
+
+def loose_nodes(avatar: smad.Avatar, truths: list[np.ndarray], poses: list[Pose]) -> Int[np.ndarray, " m"]:
+    """The nodes that skinning is furthest from on takes that were trained on."""
+    apart = []
+    for truth, pose in zip(truths, poses, strict=True):
+        driven = np.asarray(_without_dynamics(avatar, pose)[0])
+        offset = truth - driven
+        # Nodes lie a little beside the vertices that stand for them: what counts is how that changes.
+        apart.append(np.linalg.norm(offset - offset.mean(0), axis=-1))
+    mean = np.concatenate(apart).mean(0)
+    return np.argsort(mean)[-max(1, int(LOOSE * len(mean))) :]
+
+
+def node_errors(truth: np.ndarray, moved: dict[str, Moved], chosen: Int[np.ndarray, " m"]) -> dict[str, Estimate]:
+    """Mean distance in mm of chosen nodes to their true places, over frames; neighbouring frames count together."""
+    found = {}
+    for name, method in moved.items():
+        apart = np.linalg.norm(method.nodes[:, chosen] - truth[1:, chosen], axis=-1).mean(1)[SETTLE:]
+        found[name] = bootstrap(1000 * apart, np.arange(len(apart)) // 15)
+    return found
+
+
+def _vertices(video: MonocularVideo) -> np.ndarray | None:
+    path = Path(video.folder) / capture.MESHES
+    if not path.is_file():
+        return None
+    vertices = weights.load_arrays(path)[0]["vertices"].astype(np.float32)
+    pose = poses_of(video)
+    # Relative to the root already: only the heading is left to take away.
+    pose = pose.replace(root_translation=jnp.zeros_like(pose.root_translation))
+    return np.asarray(driving.to_body(pose, jnp.asarray(vertices)))
+
+
+@jax.jit
+def _rollout(avatar, state, poses):
+    return smad.rollout(avatar, state, poses)
+
+
+@jax.jit
+def _dressed(avatar, nodes, poses, frame):
+    return wear(avatar, nodes[frame - 1], jax.tree.map(lambda x: x[frame - 1], poses))
+
+
+@jax.jit
+def _without_dynamics(avatar: smad.Avatar, poses: Pose):
+    """The driven surface, and that with the offsets that a window of poses alone determines, (t, n, 3) each."""
+    config, system = avatar.config, avatar.system
+    surface = jax.lax.map(lambda pose: dynamics.driven(system, pose), poses)
+    features = (driving.track(poses, config.dt) - system.scaling.pose_mean[None]) / system.scaling.pose_scale[None]
+
+    def settled(frame):
+        window = features[jnp.maximum(frame - jnp.arange(config.deformer.pose_window), 0)]
+        return dynamics.settled(config, avatar.params, window)
+
+    return surface, surface + jax.lax.map(settled, jnp.arange(len(surface)))
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _draw(gaussians, camera, config):
+    return render(gaussians, camera, config=config).image

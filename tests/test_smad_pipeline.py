@@ -1,0 +1,97 @@
+"""SMAD end to end at the smallest sizes: films, Gaussians, dynamics, the report, and a second run that reuses."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import avatarjax as aj
+from avatarjax.data import load_monocular
+from avatarjax.data.motion import performances
+from avatarjax.smad import config as configs
+from avatarjax.smad.config import DynamicsConfig, FilmConfig, GraphConfig
+from avatarjax.train import StageConfig
+from experiments import smad as experiment
+
+CI = configs.preset("ci")
+FRAMES = 26
+
+
+def tiny():
+    return dataclasses.replace(
+        CI,
+        film=FilmConfig(48, 4, (("turn", 0), ("arcs", 0)), (("arcs", 1),), ()),
+        hull=dataclasses.replace(CI.hull, resolution=32, fraction=0.8, gaussians=200),
+        refine=dataclasses.replace(CI.refine, steps=4),
+        graph=GraphConfig(60, 4),
+        dynamics=DynamicsConfig(frames=3, stage=StageConfig(4, 2, 1e-3)),
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    whole = performances.perform
+
+    def short(rig, name, seed):
+        # Every tenth frame of a turn, so that the person is seen from all sides; the start of another.
+        step = 9 if name == "turn" else 1
+        return jax.tree.map(lambda x: x[: FRAMES * step : step], whole(rig, name, seed))
+
+    out = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(configs.PRESETS, "ci", tiny)
+        patch.setattr(performances, "perform", short)
+        yield experiment.run_experiment(experiment.Args(preset="ci", out=out))
+
+
+def test_everything_that_is_promised_is_written(finished):
+    for name in ("config.json", "metrics.json", "report.html", "test.mp4", "test.png", "avatar.safetensors"):
+        assert (finished / name).stat().st_size > 100, name
+    page = (finished / "report.html").read_text()
+    for text in ("How it moves", "skinning", "loose nodes", "PSNR in the mask", "Environment", "natural frequencies"):
+        assert text in page
+    found = json.loads((finished / "metrics.json").read_text())
+    assert set(found) == {"train arcs-0", "test arcs-1", "seconds"}
+    errors = found["test arcs-1"]["nodes"]["all nodes"]
+    assert set(errors) == {"ours", "pose window alone", "skinning"}
+    assert all(0 < error["mean"] < 500 for error in errors.values())
+
+
+def test_the_trained_avatar_loads_and_rolls_out(finished):
+    avatar = aj.smad.load(finished)
+    take = load_monocular(finished / "film" / "arcs-1")
+    poses = experiment.poses_of(take)
+    state = aj.smad.reset(avatar, jax.tree.map(lambda x: x[0], poses))
+    _, frames = jax.jit(aj.smad.rollout)(avatar, state, poses)
+    picture = aj.render(jax.tree.map(lambda x: x[-1], frames.gaussians), take.camera_at(len(take) - 1))
+    drawn = np.asarray(picture.alpha) > 0.5
+    both, either = (drawn & take.masks[-1]).sum(), (drawn | take.masks[-1]).sum()
+    assert both > 0.4 * either
+
+
+def test_a_second_run_reuses_and_a_stage_runs_anew(finished, capsys):
+    def times():
+        return {p.name: p.stat().st_mtime_ns for p in (finished / "checkpoints").glob("*.safetensors")}
+
+    before = times()
+    args = experiment.Args(preset="ci", out=finished.parents[2], stage="dynamics")
+    experiment.run_experiment(args)
+    changed = {name for name, time in times().items() if time != before[name]}
+    assert changed == {"dynamics.safetensors"}
+    assert "report:" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"avatar": "nobody"}, "unknown avatar 'nobody'.*ghostlady"),
+        ({"stage": "cook"}, "unknown stage 'cook'.*refine"),
+        ({"test": ("somewhere",)}, "--test needs --videos"),
+        ({"preset": "huge"}, "unknown preset 'huge'.*small"),
+    ],
+)
+def test_wrong_arguments_are_named(tmp_path, changes, message):
+    with pytest.raises(ValueError, match=message):
+        experiment.run_experiment(experiment.Args(out=tmp_path, **changes))
