@@ -90,7 +90,9 @@ def over_black(take: MonocularVideo, frame: int) -> tuple[jax.Array, Bool[np.nda
 
 def draw(gaussians: Gaussians, camera: Camera) -> jax.Array:
     """A cloud over black (h, w, 3)."""
-    return _draw(gaussians, camera, SplatConfig(capacity=2 * required_capacity(gaussians, camera), depth=False))
+    # Rounded to a power of two, so that the frames of a take share a compiled program.
+    capacity = 2 ** int(np.ceil(np.log2(required_capacity(gaussians, camera))))
+    return _draw(gaussians, camera, SplatConfig(capacity=capacity, depth=False))
 
 
 def true_nodes(avatar: smad.Avatar, canonical: MonocularVideo, take: MonocularVideo) -> np.ndarray | None:
