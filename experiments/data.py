@@ -14,9 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import time
-import typing
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -36,6 +33,7 @@ from avatarjax.metrics.report import Report
 from avatarjax.metrics.statistics import Estimate, bootstrap
 from avatarjax.physics.xpbd import XPBDConfig
 from experiments import command_line
+from experiments.clock import Clock
 
 SCRIPT = (1,) * 30 + (2,) * 30 + (3,) * 30 + (0,) * 30
 # Preset: side of the position maps, upscaled, frames of a transition and of a held-out one, poses, views, pixels,
@@ -93,13 +91,13 @@ def make(args: Args, name: str) -> dict[str, float]:
     """Build, measure and show one avatar's data; returns the measured numbers."""
     wanted = spec(name, args.preset, args.seed)
     folder = args.out / "data" / name / (args.preset if args.seed == 0 else f"{args.preset}-seed{args.seed}")
-    clock = _Clock(folder / "seconds.json")
+    clock = Clock(folder / "seconds.json")
     if dataset.matches(folder / "dataset", wanted):
         print(f"{name}: the dataset in {folder / 'dataset'} was finished before, reused")
     else:
         print(f"{name}: simulating and drawing into {folder / 'dataset'}")
         resumed = building.unfinished(folder / "dataset", wanted)
-        clock.run("dataset", lambda: building.build(folder / "dataset", wanted), resumed)
+        clock.run("dataset", lambda: building.build(folder / "dataset", wanted), resumed=resumed)
     avatar = avatars.build(name)
     clips = _Clips(folder / "dataset")
     numbers, means = clock.run("measuring", lambda: measure(avatar, clips, wanted))
@@ -115,23 +113,6 @@ def make(args: Args, name: str) -> dict[str, float]:
     write_report(folder, name, args, numbers, means, films, clock.seconds)
     print(f"{name}: open {folder / 'report.html'}")
     return numbers
-
-
-class _Clock:
-    """Runs work and keeps how long it took, over several runs of the program."""
-
-    def __init__(self, path: Path):
-        self.path = path
-        self.seconds: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
-
-    def run(self, name: str, work: Callable[[], typing.Any], resumed: bool = False) -> typing.Any:
-        before = self.seconds.get(name, 0.0) if resumed else 0.0
-        began = time.monotonic()
-        try:
-            return work()
-        finally:
-            self.seconds[name] = round(before + time.monotonic() - began, 1)
-            atomic.write_text(self.path, json.dumps(self.seconds, indent=1))
 
 
 class _Clips:

@@ -13,6 +13,7 @@ goes on.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import shutil
@@ -38,6 +39,7 @@ from avatarjax.smad.refine import Refined
 from avatarjax.smad.train_dynamics import Take
 from avatarjax.train import Run
 from experiments import command_line, smad_report
+from experiments.clock import Clock
 from experiments.smad_measures import poses_of
 
 STAGES = ("film", "hull", "refine", "dynamics", "report")
@@ -67,12 +69,16 @@ class Args:
 
 @dataclasses.dataclass
 class Experiment:
-    """One run: its arguments, configuration and folder, and how long its stages took."""
+    """One run: its arguments, configuration and folder."""
 
     args: Args
     config: SmadConfig
     folder: Path
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @functools.cached_property
+    def clock(self) -> Clock:
+        """How long its stages took."""
+        return Clock(self.folder / "seconds.json")
 
 
 def run_experiment(args: Args) -> Path:
@@ -84,7 +90,7 @@ def run_experiment(args: Args) -> Path:
 
     def stage(name: str, text: str, work: Callable[[], typing.Any]) -> typing.Any:
         print(f"[{time.monotonic() - began:6.1f} s] {name}: {text}", flush=True)
-        return timed(experiment, name, work)
+        return experiment.clock.run(name, work)
 
     print(f"avatar {args.avatar}, preset {args.preset}, into {folder}")
     takes = stage("film", "takes to learn from and to measure on", lambda: film(experiment))
@@ -200,19 +206,6 @@ def learn(
     system = train_dynamics.fit_scaling(config, net, skin, tracks)
     params = train_dynamics.train(config, system, tracks, run)
     return smad.Avatar(fitted.gaussians, embedded.bind(fitted.gaussians, net), system, params, config), tracks
-
-
-def timed(experiment: Experiment, stage: str, work: Callable[[], typing.Any]) -> typing.Any:
-    """Do the work of a stage and keep how long it took."""
-    began = time.monotonic()
-    result = jax.block_until_ready(work())
-    path = experiment.folder / "seconds.json"
-    known = json.loads(path.read_text()) if path.is_file() else {}
-    # A stage that was only read back took its time in an earlier run.
-    taken = round(time.monotonic() - began, 1)
-    experiment.seconds = {**known, stage: max(taken, known.get(stage, 0.0))}
-    atomic.write_text(path, json.dumps(experiment.seconds, indent=2))
-    return result
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -61,7 +61,9 @@ def write(
                 results[name]["nodes"] = {r: measures.node_errors(truth, moved, c) for r, c in regions.items()}
             if take is found[0] and part != "train":
                 film(folder, part, take, moved)
-    atomic.write_text(folder / "metrics.json", json.dumps(plain(results) | {"seconds": experiment.seconds}, indent=1))
+    atomic.write_text(
+        folder / "metrics.json", json.dumps(plain(results) | {"seconds": experiment.clock.seconds}, indent=1)
+    )
     page(experiment, avatar, results, shown)
 
 
@@ -132,7 +134,9 @@ def page(experiment: Experiment, avatar: smad.Avatar, results, shown) -> None:
         lambda axes: axes.hist(np.asarray(jnp.sqrt(anchor)) / (2 * np.pi), bins=40),
         "How stiffly nodes are held to the skinned surface: natural frequencies, 1/s, over nodes. Low ones swing.",
     )
-    report.environment(f"python -m experiments.smad --avatar {args.avatar} --preset {args.preset}", experiment.seconds)
+    report.environment(
+        f"python -m experiments.smad --avatar {args.avatar} --preset {args.preset}", experiment.clock.seconds
+    )
     report.write(folder / "report.html")
 
 

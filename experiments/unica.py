@@ -13,6 +13,7 @@ OUT/unica/AVATAR/PRESET/; open report.html there. A second run reuses what is fi
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import shutil
 import time
@@ -30,6 +31,7 @@ from avatarjax.train import read_metrics
 from avatarjax.unica import files, train, train_appearance
 from avatarjax.unica.config import AppearanceName, DynamicsName, UnicaConfig
 from experiments import command_line, pictures, unica_report, unica_shipped
+from experiments.clock import Clock
 from experiments.unica_rollout import SCRIPT, roll_and_draw
 
 STAGES = ("data", "vae", "unet", "coefficients", "pca", "base", "appearance", "texels", "rollout", "report")
@@ -71,7 +73,11 @@ class Experiment:
     config: UnicaConfig
     folder: Path
     meshes: MeshSequence | None = None
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @functools.cached_property
+    def clock(self) -> Clock:
+        """How long its stages took."""
+        return Clock(self.folder / "seconds.json")
 
     @property
     def models(self) -> tuple[DynamicsName, ...]:
@@ -137,7 +143,7 @@ def run_experiment(args: Args) -> Path:
         announce("data", "finished before, reused")
     else:
         announce("data", "simulating and rendering")
-        timed(experiment, "data", lambda: building.build(folder / "data", experiment.spec(), experiment.meshes))
+        experiment.clock.run("data", lambda: building.build(folder / "data", experiment.spec(), experiment.meshes))
     data = dataset.load(folder / "data")
     if last == 0:
         return folder
@@ -158,7 +164,7 @@ def run_experiment(args: Args) -> Path:
     for stage in experiment.stages()[1 : last + 1]:
         if stage in steps:
             announce(stage, "fitting" if stage == "pca" else "training")
-            trained[stage] = timed(experiment, stage, steps[stage])
+            trained[stage] = experiment.clock.run(stage, steps[stage])
             plot_stage(experiment, stage)
     if last < experiment.stages().index("rollout"):
         return folder
@@ -173,11 +179,10 @@ def run_experiment(args: Args) -> Path:
         name: assemble(config, data, upscaler, trained, config.dynamics, name) for name in experiment.appearances
     }
     announce("rollout", f"{len(SCRIPT)} frames, four views each")
-    frames = timed(experiment, "rollout", lambda: roll_and_draw(avatar, SCRIPT, folder, args.seed))
+    frames = experiment.clock.run("rollout", lambda: roll_and_draw(avatar, SCRIPT, folder, args.seed))
     if last == experiment.stages().index("report"):
         announce("report", "measuring against held-out data")
-        timed(
-            experiment,
+        experiment.clock.run(
             "report",
             lambda: unica_report.write(experiment, data, built, dressed, trained["base"], frames, SCRIPT),
         )
@@ -231,19 +236,6 @@ def forget(experiment: Experiment, stage: str) -> None:
         shutil.rmtree(experiment.folder / "data", ignore_errors=True)
     for path in (experiment.folder / "checkpoints").glob(f"{stage}.*"):
         path.unlink()
-
-
-def timed(experiment: Experiment, stage: str, work: Callable[[], typing.Any]) -> typing.Any:
-    """Do the work of a stage and keep how long it took."""
-    began = time.monotonic()
-    result = jax.block_until_ready(work())
-    path = experiment.folder / "seconds.json"
-    known = json.loads(path.read_text()) if path.is_file() else {}
-    # A stage that was only read back took its time in an earlier run.
-    taken = round(time.monotonic() - began, 1)
-    experiment.seconds = {**known, stage: max(taken, known.get(stage, 0.0))}
-    atomic.write_text(path, json.dumps(experiment.seconds, indent=2))
-    return result
 
 
 def plot_stage(experiment: Experiment, stage: str) -> None:

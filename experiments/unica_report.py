@@ -67,7 +67,7 @@ def write(
         # Recorded meshes come without a skeleton.
         "joints": None if experiment.meshes else unica_motion.joint_motion(*measured_on, seed, data, built, rolled),
         "images": unica_images.measure(experiment, data, dressed, plain, frames),
-        "seconds": experiment.seconds,
+        "seconds": experiment.clock.seconds,
     }
     trends = unica_motion.trends(rolled)
     measured["trends_mm_a_frame"] = {n: {"slope": t.slope, "interval": t.slope_interval} for n, t in trends.items()}
@@ -187,7 +187,7 @@ def _page(
     page.heading("Training")
     for plot in sorted((folder / "checkpoints").glob("*.png")):
         page.media(plot, f"Loss of {plot.stem}")
-    page.environment("python -m experiments.unica " + " ".join(sys.argv[1:]), experiment.seconds)
+    page.environment("python -m experiments.unica " + " ".join(sys.argv[1:]), experiment.clock.seconds)
     page.heading("Configuration")
     page.code(json.dumps(dataclasses.asdict(config), indent=2))
     return page

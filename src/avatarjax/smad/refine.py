@@ -71,10 +71,6 @@ class RefineConfig:
             raise ValueError(f"scale_range {self.scale_range} must rise from above 0")
 
 
-CI = RefineConfig(WarpConfig(width=32, layers=2), steps=300)
-SMALL = RefineConfig()
-
-
 @typing.no_type_check
 @flax.struct.dataclass
 class Refined:
