@@ -97,7 +97,7 @@ def trail(runs: list[Finished], folder: Path) -> Table:
         low, high = frames.root.min(0), frames.root.max(0)
         middle, span = (low + high) / 2, float(np.linalg.norm((high - low)[[0, 2]]))
         camera = cameras.look_at(
-            (middle[0] + 0.35 * span, 0.55 * span, middle[2] - 1.0 * span),
+            (middle[0] + 0.4 * span, 0.6 * span, middle[2] - 1.15 * span),
             (middle[0], 0.5, middle[2]),
             width=1280,
             height=640,
