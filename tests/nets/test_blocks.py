@@ -102,3 +102,10 @@ class TestResidualBlock:
         out = np.asarray(block(x, embedding))
         assert np.abs(out[0] - out[1]).max() > 1e-2
         np.testing.assert_allclose(block(x, embedding[::-1]), out[::-1], atol=1e-5)
+
+
+def test_octaves_are_the_coordinates_and_waves_of_halving_periods():
+    x = np.array([[0.25, -0.5]], np.float32)
+    angles = np.concatenate([np.pi * x, 2 * np.pi * x], axis=1)
+    expected = np.concatenate([x, np.sin(angles), np.cos(angles)], axis=1)
+    np.testing.assert_allclose(blocks.octaves(jnp.asarray(x), 2), expected, atol=1e-6)

@@ -20,6 +20,13 @@ def sinusoidal_embedding(positions: Float[Array, "b"], features: int, period: fl
     return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], axis=-1)
 
 
+def octaves(x: Float[Array, "*b c"], count: int) -> Float[Array, "*b d"]:
+    """Coordinates with their sines and cosines at `count` rising octaves, the first of period 2 (NeRF, Mildenhall et
+    al. 2020): d = c (1 + 2 count)."""
+    angles = [jnp.pi * 2.0**k * x for k in range(count)]
+    return jnp.concatenate([x, *map(jnp.sin, angles), *map(jnp.cos, angles)], axis=-1)
+
+
 def conv(inputs: int, outputs: int, *, rngs: nnx.Rngs, kernel: int = 3, stride: int = 1) -> nnx.Conv:
     """A two-dimensional convolution that keeps, or by its stride divides, the image size."""
     return nnx.Conv(inputs, outputs, (kernel, kernel), strides=stride, padding="SAME", rngs=rngs)

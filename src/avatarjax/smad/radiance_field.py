@@ -22,6 +22,7 @@ from scipy import ndimage
 from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
 from avatarjax.nets import functional
+from avatarjax.nets.blocks import octaves
 from avatarjax.nets.functional import Params
 from avatarjax.smad import hull, voxels
 from avatarjax.smad import volume_rendering as volume
@@ -90,7 +91,7 @@ class Deformation(nnx.Module):
     def __call__(self, points: Float[Array, "n s 3"], times: Float[Array, " n"]) -> Float[Array, "n s 3"]:
         """Offsets in metres of points in the box, scaled to -1..1, of n rays of one time each, 0..1."""
         # What a ray's points share is computed once.
-        x = self.point(_waves(points, self.bands[0])) + self.time(_waves(times[:, None], self.bands[1]))[:, None]
+        x = self.point(octaves(points, self.bands[0])) + self.time(octaves(times[:, None], self.bands[1]))[:, None]
         for layer in self.layers:
             x = layer(jax.nn.relu(x))
         return self.bound * jnp.tanh(self.leave(jax.nn.relu(x)))
@@ -194,12 +195,6 @@ def extract(config: FieldConfig, params: Params, grid: Grid, times: Float[Array,
 def _bias(share: float) -> float:
     """What softplus makes a depth of that takes this share of the light."""
     return float(np.log(np.expm1(-np.log1p(-share))))
-
-
-def _waves(x: Float[Array, "*b c"], bands: int) -> Float[Array, "*b d"]:
-    """Coordinates in -1..1 with sines and cosines of rising octaves (Mildenhall et al. 2020)."""
-    angles = [np.pi * 2.0**k * x for k in range(bands)]
-    return jnp.concatenate([x, *map(jnp.sin, angles), *map(jnp.cos, angles)], axis=-1)
 
 
 def _interpolate(

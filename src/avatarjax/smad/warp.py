@@ -23,6 +23,7 @@ from avatarjax import rotations
 from avatarjax.data.body import Rig
 from avatarjax.gaussians import Gaussians
 from avatarjax.nets import functional
+from avatarjax.nets.blocks import octaves
 from avatarjax.nets.functional import Params
 from avatarjax.smad import skeletal
 from avatarjax.smad.driving import Pose
@@ -66,10 +67,8 @@ class Offsets(nnx.Module):
         self.octaves, self.unit = config.octaves, config.unit
 
     def __call__(self, points: Float[Array, "n 3"], code: Float[Array, " c"]) -> Float[Array, "n 3"]:
-        angles = [np.pi * 2.0**k * points for k in range(self.octaves)]
-        waves = jnp.concatenate([points, *map(jnp.sin, angles), *map(jnp.cos, angles)], axis=-1)
         # The first layer is linear: the part of the code, which all points share, is computed once.
-        x = jax.nn.relu(self.point(waves) + self.code(code)[None])
+        x = jax.nn.relu(self.point(octaves(points, self.octaves)) + self.code(code)[None])
         for layer in self.layers:
             x = jax.nn.relu(layer(x))
         return self.unit * self.leave(x)
