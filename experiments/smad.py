@@ -33,14 +33,13 @@ from avatarjax.data.motion import performances
 from avatarjax.gaussians import Gaussians
 from avatarjax.io import atomic
 from avatarjax.physics.xpbd import XPBDConfig
-from avatarjax.smad import dynamics, embedded, files, footage, graph, hull, refine, skeletal, train_dynamics
+from avatarjax.smad import driving, dynamics, embedded, files, footage, graph, hull, refine, skeletal, train_dynamics
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.refine import Refined
 from avatarjax.smad.train_dynamics import Take
 from avatarjax.train import Run
 from experiments import command_line, smad_report
 from experiments.clock import Clock
-from experiments.smad_measures import poses_of
 
 STAGES = ("film", "hull", "refine", "dynamics", "report")
 
@@ -202,7 +201,7 @@ def learn(
     skin = None
     if shots.rig is not None:
         skin = skeletal.bind(shots.rig, shots.pose(0, 0), net.positions)
-    tracks = [Take(poses_of(take), pooled(refine.tracks(fitted, k))) for k, take in enumerate(takes)]
+    tracks = [Take(driving.recorded(take.poses), pooled(refine.tracks(fitted, k))) for k, take in enumerate(takes)]
     system = train_dynamics.fit_scaling(config, net, skin, tracks)
     params = train_dynamics.train(config, system, tracks, run)
     return smad.Avatar(fitted.gaussians, embedded.bind(fitted.gaussians, net), system, params, config), tracks

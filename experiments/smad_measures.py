@@ -56,12 +56,6 @@ def follow(avatar: smad.Avatar, take: Take) -> Moved:
     return Moved(functools.partial(_dressed, avatar, after.positions, after.poses), np.asarray(after.positions))
 
 
-def poses_of(take: MonocularVideo) -> Pose:
-    """The poses of all frames of a take."""
-    parts = take.poses.rotations, take.poses.root_rotation, take.poses.root_translation
-    return Pose(*(jnp.asarray(part, jnp.float32) for part in parts))
-
-
 def picture_errors(
     take: MonocularVideo, moved: dict[str, Moved], perceptual: lpips.Network | None
 ) -> dict[str, dict[str, Estimate]]:
@@ -72,9 +66,11 @@ def picture_errors(
         for name, method in moved.items():
             drawn = jnp.clip(draw(method.gaussians(frame), take.camera_at(frame)), 0, 1)
             mask = jnp.asarray(inside[..., None], jnp.float32)
-            # Zeros outside of the mask differ by nothing: the mean over it is larger by its share of the picture.
-            masked = image.psnr(drawn * mask, truth * mask) + 10 * jnp.log10(jnp.mean(mask))
-            found = {"PSNR": image.psnr(drawn, truth), "PSNR in the mask": masked, "SSIM": image.ssim(drawn, truth)}
+            found = {
+                "PSNR": image.psnr(drawn, truth),
+                "PSNR in the mask": image.masked_psnr(drawn, truth, mask),
+                "SSIM": image.ssim(drawn, truth),
+            }
             if perceptual is not None:
                 found["LPIPS"] = lpips.distance(perceptual, drawn, truth)
             for what, value in found.items():
@@ -131,7 +127,7 @@ def _vertices(video: MonocularVideo) -> np.ndarray | None:
     if not path.is_file():
         return None
     vertices = weights.load_arrays(path)[0]["vertices"].astype(np.float32)
-    pose = poses_of(video)
+    pose = driving.recorded(video.poses)
     # Relative to the root already: only the heading is left to take away.
     pose = pose.replace(root_translation=jnp.zeros_like(pose.root_translation))
     return np.asarray(driving.to_body(pose, jnp.asarray(vertices)))

@@ -13,12 +13,11 @@ from avatarjax.data import MonocularVideo
 from avatarjax.io import atomic, exr, video
 from avatarjax.metrics import lpips, pretrained
 from avatarjax.metrics.report import Report
-from avatarjax.smad import dynamics
+from avatarjax.smad import driving, dynamics
 from avatarjax.smad.train_dynamics import Take
 from avatarjax.train import read_metrics
 from experiments import pictures
 from experiments import smad_measures as measures
-from experiments.smad_measures import poses_of
 
 if typing.TYPE_CHECKING:
     from experiments.smad import Experiment
@@ -47,12 +46,14 @@ def write(
     regions = {"all nodes": everywhere}
     if all(truth is not None for truth in truths["train"]):
         known = [truth for truth in truths["train"] if truth is not None]
-        regions["loose nodes"] = measures.loose_nodes(avatar, known, [poses_of(take) for take in shown["train"]])
+        regions["loose nodes"] = measures.loose_nodes(
+            avatar, known, [driving.recorded(take.poses) for take in shown["train"]]
+        )
     results: dict[str, typing.Any] = {}
     fits = dict(zip([take.folder for take in takes["train"]], tracks, strict=True))
     for part, found in shown.items():
         for take, truth in zip(found, truths[part], strict=True):
-            moved = measures.move(avatar, poses_of(take))
+            moved = measures.move(avatar, driving.recorded(take.poses))
             if take.folder in fits:
                 moved["tracks"] = measures.follow(avatar, fits[take.folder])
             name = f"{part} {take.folder.name}"

@@ -11,6 +11,7 @@ import avatarjax as aj
 from avatarjax.data import load_monocular
 from avatarjax.data.motion import performances
 from avatarjax.smad import config as configs
+from avatarjax.smad import driving
 from avatarjax.smad.config import DynamicsConfig, FilmConfig, GraphConfig
 from avatarjax.train import StageConfig
 from experiments import smad as experiment
@@ -62,7 +63,7 @@ def test_everything_that_is_promised_is_written(finished):
 def test_the_trained_avatar_loads_and_rolls_out(finished):
     avatar = aj.smad.load(finished)
     take = load_monocular(finished / "film" / "arcs-1")
-    poses = experiment.poses_of(take)
+    poses = driving.recorded(take.poses)
     state = aj.smad.reset(avatar, jax.tree.map(lambda x: x[0], poses))
     _, frames = jax.jit(aj.smad.rollout)(avatar, state, poses)
     picture = aj.render(jax.tree.map(lambda x: x[-1], frames.gaussians), take.camera_at(len(take) - 1))

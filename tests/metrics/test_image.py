@@ -24,6 +24,13 @@ def test_psnr_is_that_of_scikit_image(pictures):
     np.testing.assert_allclose(image.psnr(*pictures), expected, atol=1e-5)
 
 
+def test_psnr_in_a_mask_is_that_of_its_pixels_alone(pictures):
+    inside = np.random.default_rng(2).random((len(pictures[0]), *pictures[0].shape[1:3], 1)) < 0.3
+    squared = [np.mean((a - b)[m[..., 0]] ** 2) for a, b, m in zip(*pictures, inside, strict=True)]
+    found = image.masked_psnr(*pictures, inside.astype(np.float32))
+    np.testing.assert_allclose(found, -10 * np.log10(squared), atol=1e-4)
+
+
 def test_ssim_is_that_of_scikit_image(pictures):
     def reference(a, b):
         wide = a.astype(np.float64), b.astype(np.float64)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from avatarjax import cameras, rotations, splat
-from avatarjax.data.importers.recording import MonocularVideo, Poses
+from avatarjax.data.recording import MonocularVideo, Poses
 from avatarjax.gaussians import Gaussians
 from avatarjax.smad import driving, skeletal
 from avatarjax.smad.driving import Pose

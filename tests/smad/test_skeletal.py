@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avatarjax import rotations
-from avatarjax.data.importers.recording import Poses
+from avatarjax.data.recording import Poses
 from avatarjax.smad import skeletal
 from avatarjax.smad.driving import Pose
 

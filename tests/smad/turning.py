@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from avatarjax import cameras
-from avatarjax.data.importers.recording import MonocularVideo, Poses
+from avatarjax.data.recording import MonocularVideo, Poses
 
 CENTRE = np.array([0.3, 1.0, -0.2])  # Of the body's frame, in the world.
 RED, BLUE = np.array([220, 40, 30]), np.array([20, 60, 210])

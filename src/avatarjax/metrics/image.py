@@ -22,6 +22,12 @@ def psnr(a: Images, b: Images) -> Float[Array, "..."]:
     return _psnr(jnp.asarray(a), jnp.asarray(b))
 
 
+def masked_psnr(a: Images, b: Images, mask: Float[Array | np.ndarray, "... _ _ 1"]) -> Float[Array, "..."]:
+    """`psnr` of the pixels inside a mask (..., h, w, 1) of zeros and ones; raises ValueError as that does."""
+    # Zeros outside of the mask differ by nothing: the mean over it is larger by its share of the picture.
+    return psnr(a * mask, b * mask) + 10 * jnp.log10(jnp.mean(jnp.asarray(mask), axis=(-3, -2, -1)))
+
+
 def ssim(a: Images, b: Images) -> Float[Array, "..."]:
     """Structural similarity of images (..., h, w, c) in [0, 1] as its authors define it, 1 for equal images.
 

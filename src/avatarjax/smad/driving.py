@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from avatarjax import rotations
+from avatarjax.data.recording import Poses
 
 MOTION = 11  # features of a frame beside its joints: tilt (6), root velocity (3), rate of turning (1), height (1)
 
@@ -28,6 +29,12 @@ class Pose:
     rotations: Float[Array, "*b j 3 3"]
     root_rotation: Float[Array, "*b 3 3"]
     root_translation: Float[Array, "*b 3"]
+
+
+def recorded(poses: Poses) -> Pose:
+    """The poses of all frames of a recording."""
+    parts = poses.rotations, poses.root_rotation, poses.root_translation
+    return Pose(*(jnp.asarray(part, jnp.float32) for part in parts))
 
 
 def yaw(root_rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:

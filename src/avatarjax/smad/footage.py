@@ -12,8 +12,8 @@ from jaxtyping import Bool, UInt8
 
 from avatarjax.cameras import Camera
 from avatarjax.data.body import Rig
-from avatarjax.data.importers.recording import MonocularVideo
-from avatarjax.smad import skeletal, views
+from avatarjax.data.recording import MonocularVideo
+from avatarjax.smad import driving, skeletal, views
 from avatarjax.smad.driving import Pose
 
 # One frame of so many is never trained on, the third of each group.
@@ -70,11 +70,10 @@ def gather(videos: Sequence[MonocularVideo], shrink: int = 1) -> Footage:
             raise ValueError(f"all {len(video)} masks of take {k} are empty: foreground must be True")
     rig = _skeleton(videos)
     cameras = [_shrunk_camera(views.of_video(video, np.arange(len(video))), shrink) for video in videos]
-    poses = [Pose(v.poses.rotations, v.poses.root_rotation, v.poses.root_translation) for v in videos]
     return Footage(
         np.concatenate([_decode(k, video, shrink) for k, video in enumerate(videos)]),
         jax.tree.map(lambda *x: np.concatenate(x), *cameras),
-        jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *poses),
+        jax.tree.map(lambda *x: jnp.concatenate(x), *(driving.recorded(video.poses) for video in videos)),
         rig,
         tuple(len(video) for video in videos),
     )

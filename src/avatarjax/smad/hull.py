@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from avatarjax import cameras as pinhole
 from avatarjax.cameras import Camera
-from avatarjax.data.importers.recording import MonocularVideo
+from avatarjax.data.recording import MonocularVideo
 from avatarjax.gaussians import Gaussians
 from avatarjax.smad import views, voxels
 from avatarjax.smad.voxels import Grid

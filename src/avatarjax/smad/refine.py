@@ -217,9 +217,7 @@ def quality(refined: Refined, takes: Footage, perceptual: lpips.Network | None =
         drawn = jnp.clip(_drawn(refined, jnp.asarray(frame), camera, splat), 0, 1)
         rgba = jnp.asarray(takes.rgba[frame], jnp.float32) / 255
         truth, inside = rgba[..., :3], (rgba[..., 3:] > 0.5).astype(jnp.float32)
-        # Zeros outside of the mask differ by nothing: the mean over it is larger by its share of the picture.
-        masked = image.psnr(drawn * inside, truth * inside) + 10 * jnp.log10(jnp.mean(inside))
-        values = [image.psnr(drawn, truth), masked, image.ssim(drawn, truth)]
+        values = [image.psnr(drawn, truth), image.masked_psnr(drawn, truth, inside), image.ssim(drawn, truth)]
         found.append(values + ([] if perceptual is None else [lpips.distance(perceptual, drawn, truth)]))
     means = [float(x) for x in np.mean(jax.device_get(found), axis=0)]
     return Quality(means[0], means[1], means[2], None if perceptual is None else means[3])

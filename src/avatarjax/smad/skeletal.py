@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from avatarjax import rotations
 from avatarjax.data import skinning
 from avatarjax.data.body import Rig
-from avatarjax.data.importers.recording import Poses
+from avatarjax.data.recording import Poses
 from avatarjax.smad import driving
 from avatarjax.smad.driving import Pose
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 from scipy import ndimage
 
-from avatarjax.data.importers.recording import MonocularVideo
+from avatarjax.data.recording import MonocularVideo
 from avatarjax.nets.functional import Params
 from avatarjax.smad import radiance_field, views
 from avatarjax.smad import volume_rendering as volume

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from avatarjax import rotations
 from avatarjax.cameras import Camera
-from avatarjax.data.importers.recording import MonocularVideo
+from avatarjax.data.recording import MonocularVideo
 from avatarjax.smad import driving
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from avatarjax.cameras import Camera
 from avatarjax.data.importers import series, smpl
-from avatarjax.data.importers.recording import MonocularVideo, not_rotations, read_nonzero, read_rgb
+from avatarjax.data.recording import MonocularVideo, not_rotations, read_nonzero, read_rgb
 from avatarjax.io import exr
 
 CAPTURE, CAMERAS, SMPL = "Capture", "cameras.pkl", "SMPL"

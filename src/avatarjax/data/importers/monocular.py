@@ -26,7 +26,7 @@ from jaxtyping import Bool, UInt8
 
 from avatarjax.cameras import Camera
 from avatarjax.data.importers import dress4d, series, zju_mocap
-from avatarjax.data.importers.recording import MonocularVideo, Poses, check_poses, not_rotations
+from avatarjax.data.recording import MonocularVideo, Poses, check_poses, not_rotations
 from avatarjax.io import atomic, exr, video
 
 VIDEO, IMAGES, MASKS, CAMERAS, POSES = "video.mp4", "images", "masks", "cameras.json", "poses.npz"

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from avatarjax.data.importers.recording import Poses
+from avatarjax.data.recording import Poses
 from avatarjax.io import pickles
 
 NAMES = (

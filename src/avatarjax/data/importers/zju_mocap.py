@@ -26,7 +26,7 @@ from jaxtyping import Float
 from avatarjax.cameras import Camera
 from avatarjax.data.importers import axes, series, smpl
 from avatarjax.data.importers.distortion import Undistortion
-from avatarjax.data.importers.recording import MonocularVideo, not_rotations, read_nonzero, read_rgb
+from avatarjax.data.recording import MonocularVideo, not_rotations, read_nonzero, read_rgb
 from avatarjax.io import exr
 
 ANNOTATIONS = "annots.npy"
