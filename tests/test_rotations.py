@@ -124,3 +124,14 @@ def test_similarity_fit_ignores_points_without_weight():
     target = source.at[0].set(100.0)
     scale, _, _ = rotations.similarity_fit(source, target, jnp.ones(20).at[0].set(0.0))
     np.testing.assert_allclose(scale, 1.0, rtol=1e-5)
+
+
+def test_the_nearest_rotation_is_that_of_the_polar_decomposition():
+    rng = np.random.default_rng(0)
+    turns = np.asarray(rotations.to_matrix(quaternions((200,))), np.float64)
+    mixed = rng.normal(size=(200, 3, 3))
+    matrices = turns @ (mixed @ mixed.swapaxes(1, 2) * 0.1 + np.eye(3))
+    u, _, vt = np.linalg.svd(matrices)
+    nearest = jax.jit(lambda m: rotations.to_matrix(rotations.nearest(m)))
+    np.testing.assert_allclose(nearest(jnp.asarray(matrices, jnp.float32)), u @ vt, atol=2e-3)
+    np.testing.assert_allclose(nearest(jnp.asarray(turns, jnp.float32)), turns, atol=2e-6)

@@ -12,6 +12,7 @@ from avatarjax.io import weights
 from avatarjax.smad import avatar as smad
 from avatarjax.smad import config as configs
 from avatarjax.smad import dynamics, embedded, files, graph, skeletal
+from avatarjax.smad.deformer import Deltas
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.dynamics import Scaling, System
 from tests.parameters import random_like
@@ -64,6 +65,16 @@ def test_a_rollout_is_repeated_steps(avatar, rolled):
     for k in range(5):
         state, frame = step(avatar, state, at(poses, k))
     np.testing.assert_allclose(frame.gaussians.means, rolled[1].gaussians.means[-1], atol=1e-5)
+
+
+def test_the_look_of_a_gaussian_is_its_nearest_node_s(avatar):
+    counted = jnp.arange(float(NODES))
+    look = Deltas(*jnp.zeros((2, NODES, 3)), *jnp.tile(counted[:, None], (2, 1, 3)), counted)
+    plain, nearest = avatar.gaussians, np.asarray(avatar.binding.nodes[:, 0])
+    seen = smad._looking(plain, avatar.binding, look)
+    np.testing.assert_allclose(seen.log_scales[:, 0] - plain.log_scales[:, 0], nearest, atol=1e-5)
+    np.testing.assert_allclose(seen.logit_opacities - plain.logit_opacities, nearest, atol=1e-5)
+    np.testing.assert_allclose(seen.colors, np.minimum(plain.colors + nearest[:, None], 1))
 
 
 def test_gaussians_turn_and_move_with_the_world(avatar, rolled):

@@ -8,7 +8,6 @@ import pytest
 from avatarjax import rotations
 from avatarjax.gaussians import Gaussians
 from avatarjax.smad import embedded, graph
-from avatarjax.smad.deformer import Deltas
 
 RNG = np.random.default_rng(0)
 NODES = RNG.normal(size=(40, 3))
@@ -60,20 +59,6 @@ def test_turns_of_a_flat_sheet_are_found():
     flat = graph.build(sheet, 4)
     found = embedded.turns(flat, moved(flat.positions))
     np.testing.assert_allclose(rotations.to_matrix(found), jnp.tile(rotations.to_matrix(TURN), (25, 1, 1)), atol=1e-2)
-
-
-def test_the_look_of_a_gaussian_is_its_nearest_node_s(net):
-    gaussians = cloud(NODES[::2] + 1e-3)
-    look = Deltas(
-        jnp.zeros((40, 3)),
-        jnp.zeros((40, 3)),
-        *(jnp.tile(jnp.arange(40.0)[:, None], (1, 3)) for _ in range(2)),
-        jnp.arange(40.0),
-    )
-    carried = embedded.carry(embedded.bind(gaussians, net), gaussians, net, net.positions, look)
-    np.testing.assert_allclose(carried.log_scales[:, 0], np.arange(0, 40, 2), atol=1e-5)
-    np.testing.assert_allclose(carried.logit_opacities, np.arange(0, 40, 2), atol=1e-5)
-    assert carried.colors.max() <= 1
 
 
 def test_gradients_are_finite_at_rest(net):

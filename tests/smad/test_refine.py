@@ -14,7 +14,7 @@ from avatarjax.smad.warp import WarpConfig
 from avatarjax.train import loop, read_metrics
 from tests.smad import swaying
 
-CONFIG = RefineConfig(WarpConfig(width=32, layers=2), steps=900)
+CONFIG = RefineConfig(WarpConfig(nodes=100), steps=600)
 KEY = jax.random.key(0)
 
 
@@ -38,7 +38,7 @@ def followed(request, tmp_path_factory):
     found = case(request.param)
     found.folder = tmp_path_factory.mktemp("refine")
     pose = found.takes.pose(0, 0)
-    found.begin = refine.start(found.takes, found.cloud, pose, CONFIG, KEY)
+    found.begin = refine.start(found.takes, found.cloud, pose, CONFIG)
     found.refined = refine.refine(found.takes, found.cloud, pose, CONFIG, found.folder, KEY)
     return found
 
@@ -92,8 +92,8 @@ def test_a_run_that_was_done_is_reused(followed):
 
 def test_at_the_start_the_cloud_is_as_it_was_given(followed):
     cloud = refine.at(followed.begin, 0, 0)
-    np.testing.assert_allclose(cloud.means, followed.cloud.means, atol=5e-3)
-    np.testing.assert_allclose(cloud.quats, followed.cloud.quats, atol=2e-2)
+    np.testing.assert_allclose(cloud.means, followed.cloud.means, atol=1e-4)
+    np.testing.assert_allclose(cloud.quats, followed.cloud.quats, atol=1e-3)
     for name in ("log_scales", "logit_opacities", "colors"):
         np.testing.assert_array_equal(getattr(cloud, name), getattr(followed.cloud, name))
 
@@ -168,7 +168,7 @@ def test_held_out_frames_are_never_trained_on(small, go, whole, tmp_path):
 
 
 def test_quality_in_the_mask_is_that_of_its_pixels(small):
-    begin = refine.start(small.takes, small.cloud, small.takes.pose(0, 0), CONFIG, KEY)
+    begin = refine.start(small.takes, small.cloud, small.takes.pose(0, 0), CONFIG)
     found, frames = [], np.flatnonzero(small.takes.held_out)
     room = refine._splat_config(begin, small.takes, frames, 1)
     for frame in frames:
@@ -183,14 +183,14 @@ def test_quality_in_the_mask_is_that_of_its_pixels(small):
 def test_wrong_input_is_refused(small):
     takes, cloud, pose = small.takes, small.cloud, small.takes.pose(0, 0)
     with pytest.raises(ValueError, match=r"rotations \(3, 3, 3\), poses of the takes \(4, 3, 3\)"):
-        refine.start(takes, cloud, pose.replace(rotations=pose.rotations[:3]), CONFIG, KEY)
+        refine.start(takes, cloud, pose.replace(rotations=pose.rotations[:3]), CONFIG)
     with pytest.raises(ValueError, match="300 Gaussians must be two or more, and finite"):
-        refine.start(takes, cloud.replace(means=cloud.means.at[3].set(jnp.nan)), pose, CONFIG, KEY)
+        refine.start(takes, cloud.replace(means=cloud.means.at[3].set(jnp.nan)), pose, CONFIG)
     with pytest.raises(ValueError, match="view-dependent"):
-        refine.start(takes, cloud.replace(sh=jnp.zeros((300, 3, 3))), pose, CONFIG, KEY)
+        refine.start(takes, cloud.replace(sh=jnp.zeros((300, 3, 3))), pose, CONFIG)
     short = dataclasses.replace(takes, takes=(2,) * 5)
     with pytest.raises(ValueError, match=r"takes of \(2, 2, 2, 2, 2\) frames have none to hold out"):
-        refine.quality(refine.start(short, cloud, pose, CONFIG, KEY), short)
+        refine.quality(refine.start(short, cloud, pose, CONFIG), short)
     with pytest.raises(ValueError, match="steps is 0"):
         RefineConfig(steps=0)
     with pytest.raises(ValueError, match="must rise from above 0"):
@@ -200,7 +200,7 @@ def test_wrong_input_is_refused(small):
 def test_several_frames_a_step_are_the_mean_of_each(small):
     """The loss of two frames is that of either on average, before one background."""
     takes = small.takes
-    begin = refine.start(takes, small.cloud, takes.pose(0, 0), CONFIG, KEY)
+    begin = refine.start(takes, small.cloud, takes.pose(0, 0), CONFIG)
     room = splat.SplatConfig(capacity=4000, depth=False)
 
     def loss(*frames):

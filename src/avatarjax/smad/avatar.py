@@ -22,6 +22,7 @@ from avatarjax.gaussians import Gaussians
 from avatarjax.nets.functional import Params
 from avatarjax.smad import driving, dynamics, embedded
 from avatarjax.smad.config import SmadConfig
+from avatarjax.smad.deformer import Deltas
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.dynamics import State, System
 from avatarjax.smad.embedded import Binding
@@ -80,8 +81,18 @@ def _step(avatar: Avatar, state: State, pose: Pose, gaussians: bool) -> tuple[St
     nodes = dynamics.positions(avatar.system, state)
     if not gaussians:
         return state, Frame(None, nodes)
-    cloud = embedded.carry(avatar.binding, avatar.gaussians, avatar.system.graph, nodes, look)
-    return state, Frame(_in_world(cloud, pose), nodes)
+    cloud = embedded.carry(avatar.binding, avatar.gaussians, avatar.system.graph, nodes)
+    return state, Frame(_in_world(_looking(cloud, avatar.binding, look), pose), nodes)
+
+
+def _looking(cloud: Gaussians, binding: Binding, look: Deltas) -> Gaussians:
+    """Gaussians as the network says that their nearest nodes look."""
+    nearest = binding.nodes[:, 0]
+    return cloud.replace(
+        log_scales=cloud.log_scales + look.log_scales[nearest],
+        logit_opacities=cloud.logit_opacities + look.logit_opacities[nearest],
+        colors=jnp.clip(cloud.colors + look.colors[nearest], 0.0, 1.0),
+    )
 
 
 def _in_world(cloud: Gaussians, pose: Pose) -> Gaussians:

@@ -155,7 +155,7 @@ def _ci() -> SmadConfig:
             unseen=(("kicks", 0),),
         ),
         hull=HullConfig(resolution=64, frames=60, gaussians=1_500),
-        refine=RefineConfig(WarpConfig(knot=3), steps=5_000),
+        refine=RefineConfig(WarpConfig(nodes=300), steps=5_000),
         graph=GraphConfig(nodes=300, neighbours=8),
         deformer=DeformerConfig(
             pose_width=64, pose_embedding=32, hidden=64, message=32, decoder=(64, 32), codes=4, strain=True

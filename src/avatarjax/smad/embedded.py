@@ -17,9 +17,7 @@ from scipy.spatial import cKDTree
 
 from avatarjax import rotations
 from avatarjax.gaussians import Gaussians
-from avatarjax.smad.deformer import Deltas
 from avatarjax.smad.graph import Graph
-from avatarjax.smad.warp import nearest_turn
 
 
 @typing.no_type_check
@@ -60,7 +58,7 @@ def turns(graph: Graph, positions: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
         products = products + weight[:, None, None] * now[:, :, None] * before[:, None]
     # Edges that fit nothing better turn nothing.
     size = jnp.sqrt(jnp.sum(products**2, axis=(1, 2), keepdims=True))
-    return nearest_turn(products + 1e-5 * jnp.maximum(size, 1e-9) * jnp.eye(3)[None])
+    return rotations.nearest(products + 1e-5 * jnp.maximum(size, 1e-9) * jnp.eye(3)[None])
 
 
 def carry(
@@ -68,9 +66,8 @@ def carry(
     gaussians: Gaussians,
     graph: Graph,
     positions: Float[Array, "n 3"],
-    look: Deltas | None = None,
 ) -> Gaussians:
-    """Canonical Gaussians where the nodes have gone, with what a network says of their nodes' look."""
+    """Canonical Gaussians where the nodes have gone."""
     turned = turns(graph, positions)
     matrices = rotations.to_matrix(turned)
     means, quats = jnp.zeros_like(gaussians.means), jnp.zeros_like(gaussians.quats)
@@ -81,12 +78,4 @@ def carry(
         # A quaternion and its negative are one rotation: all count on the side of the nearest node's.
         side = jnp.where(jnp.sum(turned[ids] * first, axis=1) < 0, -1.0, 1.0)
         quats = quats + (weight * side)[:, None] * turned[ids]
-    moved = gaussians.replace(means=means, quats=rotations.multiply(rotations.normalize(quats), gaussians.quats))
-    if look is None:
-        return moved
-    nearest = binding.nodes[:, 0]
-    return moved.replace(
-        log_scales=moved.log_scales + look.log_scales[nearest],
-        logit_opacities=moved.logit_opacities + look.logit_opacities[nearest],
-        colors=jnp.clip(moved.colors + look.colors[nearest], 0.0, 1.0),
-    )
+    return gaussians.replace(means=means, quats=rotations.multiply(rotations.normalize(quats), gaussians.quats))

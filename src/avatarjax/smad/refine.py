@@ -43,9 +43,9 @@ class RefineConfig:
     """What is fitted, how fast and for how long; all numbers are ours.
 
     `*_rate` are those of Adam: metres for means, logarithms, quaternions, and logits of opacities and of colours; all
-    fall exponentially to `final_rate` of themselves. silhouette, isometry: weights of those losses; the latter holds
-    the distances of each Gaussian to so many `neighbours`. scale_range: the least and the largest standard deviation,
-    in those of the median Gaussian at the start.
+    fall exponentially to `final_rate` of themselves. silhouette, isometry, offset: weights of those losses; isometry
+    holds the distances of each Gaussian to so many `neighbours`. scale_range: the least and the largest standard
+    deviation, in those of the median Gaussian at the start.
     """
 
     warp: WarpConfig = WarpConfig()
@@ -56,10 +56,11 @@ class RefineConfig:
     quats_rate: float = 3e-3
     logit_opacities_rate: float = 2e-2
     colors_rate: float = 1.5e-2
-    warp_rate: float = 2e-3
+    warp_rate: float = 6e-3
     final_rate: float = 0.05
     silhouette: float = 0.3
     isometry: float = 0.1  # SMAD 3.3
+    offset: float = 0.5
     neighbours: int = 6
     scale_range: tuple[float, float] = (0.06, 4.5)
 
@@ -105,7 +106,7 @@ class FrameBatch:
     rgba: UInt8[Array, "k h w 4"]
 
 
-def start(takes: Footage, gaussians: Gaussians, canonical: Pose, config: RefineConfig, key: Key[Array, ""]) -> Refined:
+def start(takes: Footage, gaussians: Gaussians, canonical: Pose, config: RefineConfig) -> Refined:
     """The Gaussians as they are, moved by skinning alone where the takes' poses say where joints are, else not at all.
 
     They lie in the body frame of the canonical pose. Raises ValueError for a pose with another number of joints than
@@ -120,10 +121,8 @@ def start(takes: Footage, gaussians: Gaussians, canonical: Pose, config: RefineC
         raise ValueError(f"{len(gaussians)} Gaussians must be two or more, and finite")
     if gaussians.sh is not None:
         raise ValueError("Gaussians of view-dependent colours cannot turn: give them without sh")
-    skinning = None
-    if takes.rig is not None:
-        skinning = warps.skinning(takes.rig, canonical, gaussians.means, takes.poses)
-    return Refined(gaussians, warps.init(config.warp, takes.takes, skinning, key))
+    warp = warps.init(config.warp, takes.takes, gaussians)
+    return Refined(gaussians, warp if takes.rig is None else warps.skinned(warp, takes.rig, canonical, takes.poses))
 
 
 def refine(
@@ -139,8 +138,8 @@ def refine(
     Checkpoints and metrics go to `folder`, from which an interrupted run goes on; `dropped` there counts what the
     renderer had no room for. Raises ValueError as `start`.
     """
-    init_key, order_key, step_key = jax.random.split(key, 3)
-    begin = start(takes, gaussians, canonical, config, init_key)
+    order_key, step_key = jax.random.split(key)
+    begin = start(takes, gaussians, canonical, config)
     frames = np.flatnonzero(~takes.held_out)
     splat = _splat_config(begin, takes, frames[np.linspace(0, len(frames) - 1, _LOOKS).astype(int)], _GROWTH)
     middle = float(jnp.median(gaussians.log_scales))
@@ -167,11 +166,13 @@ def refine(
 def loss(
     config: RefineConfig, splat: SplatConfig, params: Params, key: Key[Array, ""], batch: FrameBatch
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Mean absolute errors of colours and, with their weights, of alphas and mean squared stretch of edges.
+    """Mean absolute errors of colours and, with their weights, of alphas, mean squared stretch of edges, and the mean
+    square of the nodes' offsets in metres.
 
     A background that is drawn anew for each step stands behind both pictures: what shows it is not opaque. Stretch is
     that of SMAD Eq. 11, against the distances in the canonical pose and in units of their mean: a single camera does
-    not see how far away things move, and of all motions that look alike the one that stretches least is taken.
+    not see how far away things move, and of all motions that look alike the one that stretches least and stays nearest
+    to the skinned surface is taken.
     """
     refined = _assemble(params, batch.warp)
     background = jax.random.uniform(key, (3,))
@@ -187,10 +188,10 @@ def loss(
     photometric, silhouette = l1(images, truth), l1(alphas[..., None], rgba[..., 3:])
     rest = _lengths(refined.gaussians.means, batch.edges)
     stretch = (jax.vmap(_lengths, in_axes=(0, None))(clouds.means, batch.edges) - rest[None]) / jnp.mean(rest)
-    isometry = jnp.mean(stretch**2)
-    value = photometric + config.silhouette * silhouette + config.isometry * isometry
-    metrics = {"photometric": photometric, "silhouette": silhouette, "isometry": isometry}
-    return value, metrics | {"dropped": jnp.sum(dropped).astype(jnp.float32)}
+    away = jax.vmap(lambda frame: warps.offsets(refined.warp, frame))(batch.frames)
+    regular = {"silhouette": silhouette, "isometry": jnp.mean(stretch**2), "offset": jnp.mean(away**2)}
+    value = photometric + sum(getattr(config, name) * term for name, term in regular.items())
+    return value, {"photometric": photometric, **regular, "dropped": jnp.sum(dropped).astype(jnp.float32)}
 
 
 def at(refined: Refined, take: int, frame: int) -> Gaussians:
@@ -232,8 +233,7 @@ def optimiser(config: RefineConfig) -> optax.GradientTransformation:
         # A pixel is a small part of the mean, so that gradients are tiny: epsilon must be smaller.
         return optax.adam(rate, eps=1e-12)
 
-    labels = {name: name for name in names[:-1]} | {"network": "warp", "codes": "warp"}
-    return optax.multi_transform({name: adam(name) for name in names}, labels)
+    return optax.multi_transform({name: adam(name) for name in names}, {name: name for name in names})
 
 
 def _parameters(refined: Refined) -> Params:
@@ -245,8 +245,7 @@ def _parameters(refined: Refined) -> Params:
         "quats": cloud.quats,
         "logit_opacities": cloud.logit_opacities,
         "colors": jnp.log(colors / (1 - colors)),
-        "network": refined.warp.network,
-        "codes": refined.warp.codes,
+        "warp": refined.warp.offsets,
     }
 
 
@@ -254,7 +253,7 @@ def _assemble(params: Params, fixed: Warp) -> Refined:
     """The inverse of `_parameters`, with the parts of the warp that are not trained."""
     cloud = {k: params[k] for k in ("means", "log_scales", "quats", "logit_opacities")}
     gaussians = Gaussians(**cloud, colors=jax.nn.sigmoid(params["colors"]))
-    return Refined(gaussians, fixed.replace(network=params["network"], codes=params["codes"]))
+    return Refined(gaussians, fixed.replace(offsets=params["warp"]))
 
 
 def _in_range(new: Params, old: Params, batch: FrameBatch) -> Params:
@@ -290,7 +289,7 @@ def _moved(refined: Refined, frame: Int[Array, ""]) -> Gaussians:
 
 @jax.jit
 def _tracks(refined: Refined, frames: Int[Array, " f"]) -> Float[Array, "f n 3"]:
-    return jax.lax.map(lambda frame: warps.positions(refined.warp, refined.gaussians.means, frame), frames)
+    return jax.lax.map(lambda frame: warps.move(refined.warp, refined.gaussians, frame).means, frames)
 
 
 def _drawn(refined: Refined, frame: Int[Array, ""], camera: Camera, splat: SplatConfig) -> Float[Array, "h w 3"]:
