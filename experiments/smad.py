@@ -23,7 +23,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
@@ -33,7 +32,7 @@ from avatarjax.data.motion import performances
 from avatarjax.gaussians import Gaussians
 from avatarjax.io import atomic
 from avatarjax.physics.xpbd import XPBDConfig
-from avatarjax.smad import driving, dynamics, embedded, files, footage, graph, hull, refine, skeletal, train_dynamics
+from avatarjax.smad import driving, dynamics, files, footage, graph, hull, refine, skeletal, train_dynamics
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.refine import Refined
 from avatarjax.smad.train_dynamics import Take
@@ -130,7 +129,7 @@ def prepare(args: Args) -> Experiment:
     (experiment.folder / "checkpoints").mkdir(parents=True, exist_ok=True)
     if args.stage == "film":
         shutil.rmtree(experiment.folder / "film", ignore_errors=True)
-    for path in (experiment.folder / "checkpoints").glob(f"{args.stage}.*"):
+    for path in (experiment.folder / "checkpoints").glob(f"{args.stage}*"):
         path.unlink()
     atomic.write_text(experiment.folder / "config.json", json.dumps(dataclasses.asdict(config), indent=2))
     return experiment
@@ -175,36 +174,23 @@ def refined_gaussians(
 ) -> tuple[Refined, footage.Footage]:
     """Canonical Gaussians and their tracks, fitted to the takes by splatting."""
     shots = footage.gather(takes)
-    fitted = refine.refine(shots, start, shots.pose(0, 0), config.refine, run.folder, run.key("refine"))
-    return fitted, shots
+    parts = shots, start, graph.of_gaussians(start, config.graph), shots.pose(0, 0), config.refine
+    return refine.refine(*parts, run.folder, run.key("refine")), shots
 
 
 def learn(
     config: SmadConfig, takes: Sequence[MonocularVideo], refined: tuple[Refined, footage.Footage], run: Run
 ) -> tuple[smad.Avatar, list[Take]]:
-    """The avatar with dynamics that were learned from the tracks of its Gaussians, and these, pooled to nodes."""
+    """The avatar with dynamics that were learned from the tracks of its nodes, and these."""
     fitted, shots = refined
-    means = np.asarray(fitted.gaussians.means)
-    # Of the Gaussians in a voxel the most opaque is kept: no picture tells which of them is wrong.
-    wanted = min(config.graph.nodes, len(means))
-    nodes = graph.downsample(
-        means, -np.asarray(fitted.gaussians.logit_opacities, np.float64), graph.edge_for_count(means, wanted)
-    )
-    net = graph.build(nodes.positions, config.graph.neighbours, config.graph.bandwidth)
-    share = 1 / np.bincount(nodes.node)
-
-    def pooled(track):
-        summed = jnp.zeros((len(track), len(nodes.positions), 3)).at[:, nodes.node].add(track)
-        return summed * jnp.asarray(share, jnp.float32)[None, :, None]
-
     config = dynamics.sized(config, takes[0].poses.rotations.shape[1])
-    skin = None
+    net, skin = fitted.warp.graph, None
     if shots.rig is not None:
         skin = skeletal.bind(shots.rig, shots.pose(0, 0), net.positions)
-    tracks = [Take(driving.recorded(take.poses), pooled(refine.tracks(fitted, k))) for k, take in enumerate(takes)]
+    tracks = [Take(driving.recorded(take.poses), refine.tracks(fitted, k)) for k, take in enumerate(takes)]
     system = train_dynamics.fit_scaling(config, net, skin, tracks)
     params = train_dynamics.train(config, system, tracks, run)
-    return smad.Avatar(fitted.gaussians, embedded.bind(fitted.gaussians, net), system, params, config), tracks
+    return smad.Avatar(fitted.gaussians, fitted.warp.binding, system, params, config), tracks
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -12,7 +12,8 @@ from avatarjax.data import load_monocular
 from avatarjax.data.motion import performances
 from avatarjax.smad import config as configs
 from avatarjax.smad import driving
-from avatarjax.smad.config import DynamicsConfig, FilmConfig, GraphConfig
+from avatarjax.smad.config import DynamicsConfig, FilmConfig
+from avatarjax.smad.graph import GraphConfig
 from avatarjax.train import StageConfig
 from experiments import smad as experiment
 
@@ -27,7 +28,7 @@ def tiny():
         hull=dataclasses.replace(CI.hull, resolution=32, fraction=0.8, gaussians=200),
         refine=dataclasses.replace(CI.refine, steps=4),
         graph=GraphConfig(60, 4),
-        dynamics=DynamicsConfig(frames=3, stage=StageConfig(4, 2, 1e-3)),
+        dynamics=DynamicsConfig(frames=3, target_stage=StageConfig(3, 4, 1e-3), stage=StageConfig(4, 2, 1e-3)),
     )
 
 

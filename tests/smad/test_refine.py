@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from avatarjax import splat
-from avatarjax.smad import footage, refine
+from avatarjax.smad import embedded, footage, graph, refine
 from avatarjax.smad.refine import RefineConfig
-from avatarjax.smad.warp import WarpConfig
 from avatarjax.train import loop, read_metrics
 from tests.smad import swaying
 
-CONFIG = RefineConfig(WarpConfig(nodes=100), steps=600)
+CONFIG = RefineConfig(steps=600)
+NET = graph.of_gaussians(swaying.doll(), graph.GraphConfig(100, 8))
 KEY = jax.random.key(0)
 
 
@@ -38,9 +38,14 @@ def followed(request, tmp_path_factory):
     found = case(request.param)
     found.folder = tmp_path_factory.mktemp("refine")
     pose = found.takes.pose(0, 0)
-    found.begin = refine.start(found.takes, found.cloud, pose, CONFIG)
-    found.refined = refine.refine(found.takes, found.cloud, pose, CONFIG, found.folder, KEY)
+    found.begin = refine.start(found.takes, found.cloud, NET, pose, 3)
+    found.refined = refine.refine(found.takes, found.cloud, NET, pose, CONFIG, found.folder, KEY)
     return found
+
+
+def seen(refined):
+    """Where the Gaussians are in every frame."""
+    return np.stack([refine.at(refined, 0, frame).means for frame in range(refined.warp.takes[0])])
 
 
 def misses(case, tracks):
@@ -60,7 +65,7 @@ def test_frames_that_were_never_seen_are_drawn_better(followed):
 
 def test_tracks_come_nearer_to_the_truth(followed):
     """Across the view most of the way; how far things are, one camera does not tell."""
-    before, after = (misses(followed, refine.tracks(r, 0)) for r in (followed.begin, followed.refined))
+    before, after = (misses(followed, seen(r)) for r in (followed.begin, followed.refined))
     assert after[0] < 0.95 * before[0] and after[1] < 0.6 * before[1]
 
 
@@ -77,16 +82,18 @@ def test_sizes_stay_in_their_range(followed):
     assert scales.max() > 1.2 * scales.min()
 
 
-def test_a_frame_is_its_track_turned(followed):
+def test_a_frame_rides_on_its_tracks(followed):
     cloud = refine.at(followed.refined, 0, 11)
-    np.testing.assert_allclose(cloud.means, refine.tracks(followed.refined, 0)[11], atol=1e-6)
+    warp = followed.refined.warp
+    ridden = embedded.carry(warp.binding, followed.refined.gaussians, NET, refine.tracks(followed.refined, 0)[11])
+    np.testing.assert_allclose(cloud.means, ridden.means, atol=1e-5)
     assert len(cloud) == len(followed.cloud) and np.abs(cloud.quats - followed.refined.gaussians.quats).max() > 1e-3
     with pytest.raises(ValueError, match="take 0 has no frame 30"):
         refine.at(followed.refined, 0, 30)
 
 
 def test_a_run_that_was_done_is_reused(followed):
-    again = refine.refine(followed.takes, followed.cloud, followed.takes.pose(0, 0), CONFIG, followed.folder, KEY)
+    again = refine.refine(followed.takes, followed.cloud, NET, followed.takes.pose(0, 0), CONFIG, followed.folder, KEY)
     jax.tree.map(np.testing.assert_array_equal, again, followed.refined)
 
 
@@ -119,7 +126,7 @@ def go(small):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(refine, "make_step", once)
             patch.setattr(refine, "_chosen", chosen)
-            return refine.refine(takes, small.cloud, takes.pose(0, 0), FEW, folder, KEY)
+            return refine.refine(takes, small.cloud, NET, takes.pose(0, 0), FEW, folder, KEY)
 
     return run
 
@@ -168,7 +175,7 @@ def test_held_out_frames_are_never_trained_on(small, go, whole, tmp_path):
 
 
 def test_quality_in_the_mask_is_that_of_its_pixels(small):
-    begin = refine.start(small.takes, small.cloud, small.takes.pose(0, 0), CONFIG)
+    begin = refine.start(small.takes, small.cloud, NET, small.takes.pose(0, 0), 3)
     found, frames = [], np.flatnonzero(small.takes.held_out)
     room = refine._splat_config(begin, small.takes, frames, 1)
     for frame in frames:
@@ -183,16 +190,17 @@ def test_quality_in_the_mask_is_that_of_its_pixels(small):
 def test_wrong_input_is_refused(small):
     takes, cloud, pose = small.takes, small.cloud, small.takes.pose(0, 0)
     with pytest.raises(ValueError, match=r"rotations \(3, 3, 3\), poses of the takes \(4, 3, 3\)"):
-        refine.start(takes, cloud, pose.replace(rotations=pose.rotations[:3]), CONFIG)
+        refine.start(takes, cloud, NET, pose.replace(rotations=pose.rotations[:3]), 3)
     with pytest.raises(ValueError, match="300 Gaussians must be two or more, and finite"):
-        refine.start(takes, cloud.replace(means=cloud.means.at[3].set(jnp.nan)), pose, CONFIG)
+        refine.start(takes, cloud.replace(means=cloud.means.at[3].set(jnp.nan)), NET, pose, 3)
     with pytest.raises(ValueError, match="view-dependent"):
-        refine.start(takes, cloud.replace(sh=jnp.zeros((300, 3, 3))), pose, CONFIG)
+        refine.start(takes, cloud.replace(sh=jnp.zeros((300, 3, 3))), NET, pose, 3)
     short = dataclasses.replace(takes, takes=(2,) * 5)
     with pytest.raises(ValueError, match=r"takes of \(2, 2, 2, 2, 2\) frames have none to hold out"):
-        refine.quality(refine.start(short, cloud, pose, CONFIG), short)
-    with pytest.raises(ValueError, match="steps is 0"):
-        RefineConfig(steps=0)
+        refine.quality(refine.start(short, cloud, NET, pose, 3), short)
+    for name in ("steps", "knot"):
+        with pytest.raises(ValueError, match=f"{name} is 0"):
+            RefineConfig(**{name: 0})
     with pytest.raises(ValueError, match="must rise from above 0"):
         RefineConfig(scale_range=(2.0, 1.0))
 
@@ -200,7 +208,7 @@ def test_wrong_input_is_refused(small):
 def test_several_frames_a_step_are_the_mean_of_each(small):
     """The loss of two frames is that of either on average, before one background."""
     takes = small.takes
-    begin = refine.start(takes, small.cloud, takes.pose(0, 0), CONFIG)
+    begin = refine.start(takes, small.cloud, NET, takes.pose(0, 0), 3)
     room = splat.SplatConfig(capacity=4000, depth=False)
 
     def loss(*frames):

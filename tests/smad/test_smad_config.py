@@ -6,7 +6,8 @@ import jaxtyping
 import pytest
 
 from avatarjax.smad import PRESETS, SmadConfig, preset
-from avatarjax.smad.config import DeformerConfig, GraphConfig
+from avatarjax.smad.config import DeformerConfig
+from avatarjax.smad.graph import GraphConfig
 
 
 @pytest.mark.parametrize(("name", "nodes"), [("ci", 300), ("small", 2_000), ("base", 40_000), ("paper", 40_000)])

@@ -19,7 +19,7 @@ BASE = dynamics.sized(configs.preset("ci"), 1)
 CONFIG = dataclasses.replace(
     BASE,
     deformer=dataclasses.replace(BASE.deformer, hidden=16, message=8, decoder=(16, 8), pose_width=16),
-    dynamics=DynamicsConfig(frames=8, stage=StageConfig(150, 8, 2e-2)),
+    dynamics=DynamicsConfig(frames=8, target_stage=StageConfig(60, 32, 1e-2), stage=StageConfig(150, 8, 2e-2)),
 )
 POINTS = np.random.default_rng(0).normal(size=(16, 3)) * 0.3
 FREQUENCY, DAMPING = 9.0, 4.0

@@ -7,21 +7,20 @@ import pytest
 from scipy.interpolate import BSpline
 
 from avatarjax import rotations
-from avatarjax.smad import driving, skeletal
+from avatarjax.smad import driving, graph, skeletal
 from avatarjax.smad import warp as warps
-from avatarjax.smad.warp import WarpConfig
 from tests.smad import swaying
 
 # Compiled as a whole these are faster, also for a single call.
 nodes, move, offsets = map(jax.jit, (warps.nodes, warps.move, warps.offsets))
 pose_points, bind = jax.jit(skeletal.pose_points), jax.jit(skeletal.bind)
-TINY = WarpConfig(nodes=40, neighbours=6, knot=4)
 CLOUD = swaying.doll(80)
+NET = graph.of_gaussians(CLOUD, graph.GraphConfig(40, 6))
 
 
 def free(takes=(9, 6), seed=None, size=0.05):
     """A warp without skeleton; with a seed, one that moves things."""
-    warp = warps.init(TINY, takes, CLOUD)
+    warp = warps.init(NET, CLOUD, takes, 4)
     if seed is None:
         return warp
     wild = size * np.random.default_rng(seed).normal(size=warp.offsets.shape)
@@ -32,7 +31,7 @@ def skinned(frames=5, bend=0.8):
     told = swaying.poses(frames, bend)
     poses = swaying.pose(told, np.arange(frames))
     rig = skeletal.rig_of(told)
-    return warps.skinned(warps.init(TINY, (frames,), CLOUD), rig, swaying.pose(told, 1), poses), rig, poses
+    return warps.skinned(warps.init(NET, CLOUD, (frames,), 4), rig, swaying.pose(told, 1), poses), rig, poses
 
 
 def test_without_a_skeleton_nothing_moves_before_training():
@@ -125,9 +124,7 @@ def test_frames_that_are_not_there_are_refused():
         with pytest.raises(ValueError, match=rf"take {take} has no frame {frame}: the takes have \(9, 6\)"):
             warps.index(warp, take, frame)
     with pytest.raises(ValueError, match="at least one take of one frame"):
-        warps.init(TINY, (3, 0), CLOUD)
+        warps.init(NET, CLOUD, (3, 0), 4)
     _, rig, poses = skinned()
     with pytest.raises(ValueError, match=r"5 poses for takes of \(4,\)"):
-        warps.skinned(warps.init(TINY, (4,), CLOUD), rig, jax.tree.map(lambda x: x[1], poses), poses)
-    with pytest.raises(ValueError, match="knot is 0"):
-        WarpConfig(knot=0)
+        warps.skinned(warps.init(NET, CLOUD, (4,), 4), rig, jax.tree.map(lambda x: x[1], poses), poses)

@@ -10,9 +10,9 @@ import dataclasses
 import typing
 from collections.abc import Callable
 
+from avatarjax.smad.graph import GraphConfig
 from avatarjax.smad.hull import HullConfig
 from avatarjax.smad.refine import RefineConfig
-from avatarjax.smad.warp import WarpConfig
 from avatarjax.train import StageConfig
 
 
@@ -37,20 +37,6 @@ class FilmConfig:
     train: tuple[tuple[str, int], ...] = (("turn", 0), *_seeds(("arcs", "spins", "dance"), (0, 1, 2)))
     test: tuple[tuple[str, int], ...] = _seeds(("arcs", "spins", "dance"), (3,))
     unseen: tuple[tuple[str, int], ...] = _seeds(("kicks", "jumps"), (0,))
-
-
-@dataclasses.dataclass(frozen=True)
-class GraphConfig:
-    """How many nodes, and how many nearest neighbours make an edge. bandwidth: rho_a in metres, None for the mean
-    length of the edges (ours: the paper has no number)."""
-
-    nodes: int = 40_000
-    neighbours: int = 16
-    bandwidth: float | None = None
-
-    def __post_init__(self):
-        if not 1 <= self.neighbours < self.nodes:
-            raise ValueError(f"{self.neighbours} neighbours need more nodes than {self.nodes}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,9 +93,10 @@ class DeformerConfig:
 class DynamicsConfig:
     """How the dynamics are learned from tracks. All but the weights of the losses is ours.
 
-    frames: length of the rollouts that are trained through. noise: of the offsets from which they start, in units of
-    the offsets' spread, constant over the history. target: weight of the error of what poses alone say. isometry and
-    damping: weights of Eq. 11, means over edges and nodes.
+    target_stage: of what poses alone say of the offsets, which needs no rollouts, in frames; stage: of all, in rollouts
+    of so many `frames`, which starts from there. noise: of the offsets from which rollouts start, in units of the
+    offsets' spread, constant over the history. target: weight of the error of what poses alone say. isometry, damping:
+    weights of Eq. 11, means over edges and nodes.
     """
 
     frames: int = 12
@@ -117,6 +104,7 @@ class DynamicsConfig:
     target: float = 0.5
     isometry: float = 0.1
     damping: float = 0.01
+    target_stage: StageConfig = StageConfig(6_000, 64, 1e-3)
     stage: StageConfig = StageConfig(2_000, 8, 1e-3)
 
 
@@ -155,12 +143,12 @@ def _ci() -> SmadConfig:
             unseen=(("kicks", 0),),
         ),
         hull=HullConfig(resolution=64, frames=60, gaussians=1_500),
-        refine=RefineConfig(WarpConfig(nodes=300), steps=5_000),
+        refine=RefineConfig(steps=5_000),
         graph=GraphConfig(nodes=300, neighbours=8),
         deformer=DeformerConfig(
             pose_width=64, pose_embedding=32, hidden=64, message=32, decoder=(64, 32), codes=4, strain=True
         ),
-        dynamics=DynamicsConfig(frames=8, stage=StageConfig(400, 4, 3e-3)),
+        dynamics=DynamicsConfig(frames=8, target_stage=StageConfig(2_000, 64, 3e-3), stage=StageConfig(300, 4, 1e-3)),
     )
 
 

@@ -6,6 +6,7 @@ the canonical space and stay so: the paper's A_ij(t) names a time and never says
 
 from __future__ import annotations
 
+import dataclasses
 import typing
 
 import flax.struct
@@ -14,10 +15,26 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from avatarjax.gaussians import Gaussians
+
 # Voxels along the longest side of the cloud: three such counts fit into one 64-bit key.
 _CELLS = 2**20
 # A splat ends, as 3DGS draws it, at so many standard deviations.
 _SPLAT_RADIUS = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class GraphConfig:
+    """How many nodes, and how many nearest neighbours make an edge. bandwidth: rho_a in metres, None for the mean
+    length of the edges (ours: the paper has no number)."""
+
+    nodes: int = 40_000
+    neighbours: int = 16
+    bandwidth: float | None = None
+
+    def __post_init__(self):
+        if not 1 <= self.neighbours < self.nodes:
+            raise ValueError(f"{self.neighbours} neighbours need more nodes than {self.nodes}")
 
 
 @typing.no_type_check
@@ -99,6 +116,16 @@ def edge_for_count(positions: Float[np.ndarray, "n 3"], nodes: int, tolerance: f
             break
         low, high = (edge, high) if count > nodes else (low, edge)
     return float(best)
+
+
+def of_gaussians(gaussians: Gaussians, config: GraphConfig) -> Graph:
+    """The graph of about `config.nodes` nodes, at most one for each canonical Gaussian; raises ValueError as `build`.
+
+    Of the Gaussians in a voxel the most opaque is kept: no picture tells which of them is wrong.
+    """
+    means, opaque = np.asarray(gaussians.means), np.asarray(gaussians.logit_opacities, np.float64)
+    nodes = downsample(means, -opaque, edge_for_count(means, min(config.nodes, len(means))))
+    return build(nodes.positions, config.neighbours, config.bandwidth)
 
 
 def build(positions: Float[np.ndarray, "n 3"], neighbours: int = 16, bandwidth: float | None = None) -> Graph:

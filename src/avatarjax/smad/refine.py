@@ -2,7 +2,7 @@
 
 The paper gets canonical Gaussians G^c from a deformable radiance field in 12.5 hours (SMAD 3, "Baselines"; Table I).
 Here a hull's surface is drawn, moved by a warp that is told the frame, and both are fitted to the pictures. What comes
-of it beside G^c are tracks: where every Gaussian is in every frame, from which the dynamics are learned.
+of it beside G^c are tracks: where every node is in every frame, from which the dynamics are learned.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
 from avatarjax.metrics import image, lpips
 from avatarjax.nets.functional import Params
-from avatarjax.smad import graph
+from avatarjax.smad import graph as graphs
 from avatarjax.smad import warp as warps
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.footage import Footage
-from avatarjax.smad.warp import Warp, WarpConfig
+from avatarjax.smad.graph import Graph
+from avatarjax.smad.warp import Warp
 from avatarjax.splat import SplatConfig, l1, render, required_capacity
 from avatarjax.train import fit, make_step, new_state, weights
 from avatarjax.train.state import Metrics
@@ -42,13 +43,14 @@ _GROWTH, _LOOKS = 3, 16
 class RefineConfig:
     """What is fitted, how fast and for how long; all numbers are ours.
 
+    knot: frames from one control value of a node's spline to the next.
     `*_rate` are those of Adam: metres for means, logarithms, quaternions, and logits of opacities and of colours; all
     fall exponentially to `final_rate` of themselves. silhouette, isometry, offset: weights of those losses; isometry
     holds the distances of each Gaussian to so many `neighbours`. scale_range: the least and the largest standard
     deviation, in those of the median Gaussian at the start.
     """
 
-    warp: WarpConfig = WarpConfig()
+    knot: int = 3
     steps: int = 4000
     frames_per_step: int = 1
     means_rate: float = 4e-4
@@ -65,7 +67,7 @@ class RefineConfig:
     scale_range: tuple[float, float] = (0.06, 4.5)
 
     def __post_init__(self):
-        for name in ("steps", "frames_per_step", "neighbours"):
+        for name in ("knot", "steps", "frames_per_step", "neighbours"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: at least 1 is needed")
         if not 0 < self.scale_range[0] < self.scale_range[1]:
@@ -106,8 +108,9 @@ class FrameBatch:
     rgba: UInt8[Array, "k h w 4"]
 
 
-def start(takes: Footage, gaussians: Gaussians, canonical: Pose, config: RefineConfig) -> Refined:
-    """The Gaussians as they are, moved by skinning alone where the takes' poses say where joints are, else not at all.
+def start(takes: Footage, gaussians: Gaussians, graph: Graph, canonical: Pose, knot: int) -> Refined:
+    """The Gaussians as they are, on the nodes of a graph that are moved by skinning alone where the takes' poses say
+    where joints are, else not at all.
 
     They lie in the body frame of the canonical pose. Raises ValueError for a pose with another number of joints than
     the takes', and for Gaussians that are fewer than two, not finite or of view-dependent colours.
@@ -121,13 +124,14 @@ def start(takes: Footage, gaussians: Gaussians, canonical: Pose, config: RefineC
         raise ValueError(f"{len(gaussians)} Gaussians must be two or more, and finite")
     if gaussians.sh is not None:
         raise ValueError("Gaussians of view-dependent colours cannot turn: give them without sh")
-    warp = warps.init(config.warp, takes.takes, gaussians)
+    warp = warps.init(graph, gaussians, takes.takes, knot)
     return Refined(gaussians, warp if takes.rig is None else warps.skinned(warp, takes.rig, canonical, takes.poses))
 
 
 def refine(
     takes: Footage,
     gaussians: Gaussians,
+    graph: Graph,
     canonical: Pose,
     config: RefineConfig,
     folder: str | os.PathLike,
@@ -139,12 +143,12 @@ def refine(
     renderer had no room for. Raises ValueError as `start`.
     """
     order_key, step_key = jax.random.split(key)
-    begin = start(takes, gaussians, canonical, config)
+    begin = start(takes, gaussians, graph, canonical, config.knot)
     frames = np.flatnonzero(~takes.held_out)
     splat = _splat_config(begin, takes, frames[np.linspace(0, len(frames) - 1, _LOOKS).astype(int)], _GROWTH)
     middle = float(jnp.median(gaussians.log_scales))
     near = min(config.neighbours, len(gaussians) - 1)
-    edges = graph.build(np.asarray(gaussians.means), near).edges
+    edges = graphs.build(np.asarray(gaussians.means), near).edges
     fixed = begin.warp, edges, jnp.asarray(middle + np.log(config.scale_range), jnp.float32)
     seed = int(jax.random.bits(order_key))
 
@@ -200,7 +204,7 @@ def at(refined: Refined, take: int, frame: int) -> Gaussians:
 
 
 def tracks(refined: Refined, take: int) -> Float[Array, "f n 3"]:
-    """Where every Gaussian is in every frame of a take, each in its body frame, metres."""
+    """Where every node is in every frame of a take, each in its body frame, metres."""
     first = warps.index(refined.warp, take, 0)
     return _tracks(refined, jnp.arange(first, first + refined.warp.takes[take]))
 
@@ -289,7 +293,7 @@ def _moved(refined: Refined, frame: Int[Array, ""]) -> Gaussians:
 
 @jax.jit
 def _tracks(refined: Refined, frames: Int[Array, " f"]) -> Float[Array, "f n 3"]:
-    return jax.lax.map(lambda frame: warps.move(refined.warp, refined.gaussians, frame).means, frames)
+    return jax.lax.map(lambda frame: warps.nodes(refined.warp, frame), frames)
 
 
 def _drawn(refined: Refined, frame: Int[Array, ""], camera: Camera, splat: SplatConfig) -> Float[Array, "h w 3"]:

@@ -140,8 +140,10 @@ def losses(
 
 
 def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -> Params:
-    """Parameters of the dynamics, learned from takes (SMAD Eq. 9 with the tracks' error for the picture's)."""
+    """Parameters of the dynamics, learned from takes (SMAD Eq. 9 with the tracks' error for the picture's): first the
+    target alone, from single frames, then all, through rollouts."""
     recorded = record(config, system, takes)
+    initial = _train_target(config, system, recorded, run)
     settings = config.dynamics
     first = np.asarray(recorded.first)
     ends = np.append(np.flatnonzero(np.diff(first)) + 1, len(first))
@@ -175,8 +177,27 @@ def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -
         weights = {"data": 1.0, "target": settings.target, "isometry": settings.isometry, "damping": settings.damping}
         return sum(weights[name] * value for name, value in found.items()), found
 
-    initial = dynamics.init(config, system, run.key("dynamics"))
     return train_stage(run, "dynamics", settings.stage, config, loss, initial, batch_at)
+
+
+def _train_target(config: SmadConfig, system: System, recorded: Recorded, run: Run) -> Params:
+    """Fresh parameters with a target that is learned: a hundred of these steps take the time of a rollout's."""
+    stage = config.dynamics.target_stage
+
+    def batch_at(step):
+        frames = np.random.default_rng([run.seed, step]).integers(len(recorded.first), size=stage.batch)
+        return {"recorded": recorded, "system": system, "frames": frames.astype(np.int32)}
+
+    def loss(params, key, batch):
+        def missed(frame):
+            window = state_at(config, batch["recorded"], frame).window
+            return jnp.mean((dynamics.settled(config, params, window) - batch["recorded"].offsets[frame]) ** 2)
+
+        return jnp.mean(jax.vmap(missed)(batch["frames"])) / batch["system"].scaling.offset ** 2, {}
+
+    return train_stage(
+        run, "dynamics_target", stage, config, loss, dynamics.init(config, system, run.key("dynamics")), batch_at
+    )
 
 
 def replay(config: SmadConfig, params: Params, system: System, take: Take, start: int) -> Float[Array, "t n 3"]:

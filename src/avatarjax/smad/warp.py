@@ -13,7 +13,6 @@ running figure of 96 pixels it reached 10.8 dB in the mask of held-out frames in
 
 from __future__ import annotations
 
-import dataclasses
 import typing
 
 import flax.struct
@@ -24,27 +23,12 @@ from jaxtyping import Array, Float, Int
 
 from avatarjax.data.body import Rig
 from avatarjax.gaussians import Gaussians
-from avatarjax.smad import embedded, graph, skeletal
+from avatarjax.smad import embedded, skeletal
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.embedded import Binding
 from avatarjax.smad.graph import Graph
 
 _ORDER = 4  # control values of a cubic spline that a frame depends on
-
-
-@dataclasses.dataclass(frozen=True)
-class WarpConfig:
-    """nodes: about how many the Gaussians ride on. neighbours: of each node, by which it is told how it turns. knot:
-    frames from one of a spline's control values to the next."""
-
-    nodes: int = 400
-    neighbours: int = 8
-    knot: int = 3
-
-    def __post_init__(self):
-        for name in ("nodes", "neighbours", "knot"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: at least 1 is needed")
 
 
 @typing.no_type_check
@@ -76,25 +60,24 @@ class Warp:
     takes: tuple[int, ...] = flax.struct.field(pytree_node=False)
 
 
-def init(config: WarpConfig, takes: tuple[int, ...], gaussians: Gaussians) -> Warp:
-    """A warp that moves nothing; `skinned` gives it bones. Raises ValueError for takes without frames, and for
-    Gaussians that are too few for so many neighbours."""
+def init(graph: Graph, gaussians: Gaussians, takes: tuple[int, ...], knot: int) -> Warp:
+    """A warp that moves nothing, with a control value for each `knot` frames; `skinned` gives it bones.
+
+    Raises ValueError for takes without frames.
+    """
     if not takes or min(takes) < 1:
         raise ValueError(f"takes of {takes} frames: at least one take of one frame is needed")
-    means = np.asarray(gaussians.means)
-    side = graph.edge_for_count(means, min(config.nodes, len(means)))
-    nodes = graph.build(graph.downsample(means, np.zeros(len(means)), side).positions, config.neighbours)
     rows, shares, first = [], [], 0
     for frames in takes:
-        spans = max(1, -(-(frames - 1) // config.knot))
-        row = np.minimum(np.arange(frames) // config.knot, spans - 1)
+        spans = max(1, -(-(frames - 1) // knot))
+        row = np.minimum(np.arange(frames) // knot, spans - 1)
         rows.append(first + row)
-        shares.append(np.arange(frames) / config.knot - row)
+        shares.append(np.arange(frames) / knot - row)
         first += spans + _ORDER - 1
     return Warp(
-        graph=nodes,
-        binding=embedded.bind(gaussians, nodes),
-        offsets=jnp.zeros((first, len(nodes.positions), 3)),
+        graph=graph,
+        binding=embedded.bind(gaussians, graph),
+        offsets=jnp.zeros((first, len(graph.positions), 3)),
         rows=jnp.asarray(np.concatenate(rows), jnp.int32),
         shares=jnp.asarray(np.concatenate(shares), jnp.float32),
         skinning=None,
