@@ -32,7 +32,18 @@ from avatarjax.data.motion import performances
 from avatarjax.gaussians import Gaussians
 from avatarjax.io import atomic
 from avatarjax.physics.xpbd import XPBDConfig
-from avatarjax.smad import driving, dynamics, files, footage, graph, hull, refine, skeletal, train_dynamics
+from avatarjax.smad import (
+    driving,
+    dynamics,
+    files,
+    footage,
+    graph,
+    hull,
+    refine,
+    skeletal,
+    train_dynamics,
+    train_pictures,
+)
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.refine import Refined
 from avatarjax.smad.train_dynamics import Take
@@ -190,7 +201,8 @@ def learn(
     tracks = [Take(driving.recorded(take.poses), refine.tracks(fitted, k)) for k, take in enumerate(takes)]
     system = train_dynamics.fit_scaling(config, net, skin, tracks)
     params = train_dynamics.train(config, system, tracks, run)
-    return smad.Avatar(fitted.gaussians, fitted.warp.binding, system, params, config), tracks
+    avatar = smad.Avatar(fitted.gaussians, fitted.warp.binding, system, params, config)
+    return train_pictures.train(avatar, shots, tracks, run), tracks
 
 
 def main(argv: list[str] | None = None) -> int:

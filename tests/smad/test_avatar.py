@@ -70,8 +70,9 @@ def test_a_rollout_is_repeated_steps(avatar, rolled):
 def test_the_look_of_a_gaussian_is_its_nearest_node_s(avatar):
     counted = jnp.arange(float(NODES))
     look = Deltas(*jnp.zeros((2, NODES, 3)), *jnp.tile(counted[:, None], (2, 1, 3)), counted)
-    plain, nearest = avatar.gaussians, np.asarray(avatar.binding.nodes[:, 0])
-    seen = smad._looking(plain, avatar.binding, look)
+    nearest = np.asarray(avatar.binding.nodes[:, 0])
+    plain, seen = avatar.gaussians, smad.dressed(avatar, avatar.system.graph.positions, look)
+    np.testing.assert_allclose(seen.means, plain.means, atol=1e-5)
     np.testing.assert_allclose(seen.log_scales[:, 0] - plain.log_scales[:, 0], nearest, atol=1e-5)
     np.testing.assert_allclose(seen.logit_opacities - plain.logit_opacities, nearest, atol=1e-5)
     np.testing.assert_allclose(seen.colors, np.minimum(plain.colors + nearest[:, None], 1))

@@ -76,23 +76,23 @@ def wear(avatar: Avatar, nodes: Float[Array, "n 3"], pose: Pose) -> Gaussians:
     return _in_world(embedded.carry(avatar.binding, avatar.gaussians, avatar.system.graph, nodes), pose)
 
 
-def _step(avatar: Avatar, state: State, pose: Pose, gaussians: bool) -> tuple[State, Frame]:
-    state, look = dynamics.step(avatar.config, avatar.params, avatar.system, state, pose)
-    nodes = dynamics.positions(avatar.system, state)
-    if not gaussians:
-        return state, Frame(None, nodes)
+def dressed(avatar: Avatar, nodes: Float[Array, "n 3"], look: Deltas) -> Gaussians:
+    """Gaussians in the body frame, on nodes there, each as the network says that its nearest node looks."""
     cloud = embedded.carry(avatar.binding, avatar.gaussians, avatar.system.graph, nodes)
-    return state, Frame(_in_world(_looking(cloud, avatar.binding, look), pose), nodes)
-
-
-def _looking(cloud: Gaussians, binding: Binding, look: Deltas) -> Gaussians:
-    """Gaussians as the network says that their nearest nodes look."""
-    nearest = binding.nodes[:, 0]
+    nearest = avatar.binding.nodes[:, 0]
     return cloud.replace(
         log_scales=cloud.log_scales + look.log_scales[nearest],
         logit_opacities=cloud.logit_opacities + look.logit_opacities[nearest],
         colors=jnp.clip(cloud.colors + look.colors[nearest], 0.0, 1.0),
     )
+
+
+def _step(avatar: Avatar, state: State, pose: Pose, gaussians: bool) -> tuple[State, Frame]:
+    state, look = dynamics.step(avatar.config, avatar.params, avatar.system, state, pose)
+    nodes = dynamics.positions(avatar.system, state)
+    if not gaussians:
+        return state, Frame(None, nodes)
+    return state, Frame(_in_world(dressed(avatar, nodes, look), pose), nodes)
 
 
 def _in_world(cloud: Gaussians, pose: Pose) -> Gaussians:

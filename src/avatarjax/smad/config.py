@@ -96,7 +96,8 @@ class DynamicsConfig:
     target_stage: of what poses alone say of the offsets, which needs no rollouts, in frames; stage: of all, in rollouts
     of so many `frames`, which starts from there. noise: of the offsets from which rollouts start, in units of the
     offsets' spread, constant over the history. target: weight of the error of what poses alone say. isometry, damping:
-    weights of Eq. 11, means over edges and nodes.
+    weights of Eq. 11, means over edges and nodes. picture_stage: of training from pictures after that (Eq. 10), which
+    draws so many `pictures` of each rollout; photometric, tracks: weights of their error there, and of the tracks'.
     """
 
     frames: int = 12
@@ -106,6 +107,10 @@ class DynamicsConfig:
     damping: float = 0.01
     target_stage: StageConfig = StageConfig(6_000, 64, 1e-3)
     stage: StageConfig = StageConfig(2_000, 8, 1e-3)
+    picture_stage: StageConfig = StageConfig(2_000, 4, 3e-4)
+    pictures: int = 3
+    photometric: float = 3.0
+    tracks: float = 0.1
 
 
 @dataclasses.dataclass(frozen=True)

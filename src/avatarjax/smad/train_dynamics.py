@@ -13,16 +13,18 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Key
 
 from avatarjax.nets.functional import Params
 from avatarjax.smad import driving, dynamics
 from avatarjax.smad.config import SmadConfig
+from avatarjax.smad.deformer import Deltas
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.dynamics import Scaling, State, System
 from avatarjax.smad.graph import Graph
 from avatarjax.smad.skeletal import Skin
 from avatarjax.train import Run, train_stage
+from avatarjax.train.state import Metrics
 
 
 @typing.no_type_check
@@ -145,11 +147,7 @@ def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -
     recorded = record(config, system, takes)
     initial = _train_target(config, system, recorded, run)
     settings = config.dynamics
-    first = np.asarray(recorded.first)
-    ends = np.append(np.flatnonzero(np.diff(first)) + 1, len(first))
-    last = ends[np.searchsorted(ends, np.arange(len(first)), side="right")]
-    frames = min(settings.frames, int(min(np.diff(np.append(0, ends)))) - 1)
-    starts = np.flatnonzero(np.arange(len(first)) + frames < last)
+    starts, frames = rollouts(recorded, settings.frames)
 
     def batch_at(step):
         rng = np.random.default_rng([run.seed, step])
@@ -159,25 +157,52 @@ def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -
         system, recorded = batch["system"], batch["recorded"]
 
         def one(start, key):
-            state = state_at(config, recorded, start)
-            wrong = jax.random.normal(key, state.offset.shape)
-            state = state.replace(offset=state.offset + settings.noise * system.scaling.offset * wrong)
-            ahead = start + 1 + jnp.arange(frames)
-            poses = jax.tree.map(lambda x: x[ahead], recorded.poses)
+            states, _ = roll(config, params, system, recorded, start, frames, key)
+            return losses(config, params, system, recorded.offsets[start + 1 + jnp.arange(frames)], states)
 
-            def advance(state, pose):
-                state, _ = dynamics.step(config, params, system, state, pose)
-                return state, state
-
-            _, states = jax.lax.scan(advance, state, poses)
-            return losses(config, params, system, recorded.offsets[ahead], states)
-
-        found = jax.vmap(one)(batch["start"], jax.random.split(key, len(batch["start"])))
-        found = {name: jnp.mean(values) for name, values in found.items()}
-        weights = {"data": 1.0, "target": settings.target, "isometry": settings.isometry, "damping": settings.damping}
-        return sum(weights[name] * value for name, value in found.items()), found
+        return total(config, jax.vmap(one)(batch["start"], jax.random.split(key, len(batch["start"]))))
 
     return train_stage(run, "dynamics", settings.stage, config, loss, initial, batch_at)
+
+
+def rollouts(recorded: Recorded, frames: int) -> tuple[Int[np.ndarray, " s"], int]:
+    """The frames from which a rollout of so many frames stays in its take, and how many those are: `frames`, or as many
+    as the shortest take has."""
+    first = np.asarray(recorded.first)
+    ends = np.append(np.flatnonzero(np.diff(first)) + 1, len(first))
+    last = ends[np.searchsorted(ends, np.arange(len(first)), side="right")]
+    frames = min(frames, int(min(np.diff(np.append(0, ends)))) - 1)
+    return np.flatnonzero(np.arange(len(first)) + frames < last), frames
+
+
+def roll(
+    config: SmadConfig,
+    params: Params,
+    system: System,
+    recorded: Recorded,
+    start: Int[Array, ""],
+    frames: int,
+    key: Key[Array, ""],
+) -> tuple[State, Deltas]:
+    """The states of a rollout under the poses after a recorded frame, from the state there made a little wrong, and
+    what the network says of the look, both with a leading axis of `frames`."""
+    state = state_at(config, recorded, start)
+    wrong = jax.random.normal(key, state.offset.shape)
+    state = state.replace(offset=state.offset + config.dynamics.noise * system.scaling.offset * wrong)
+    poses = jax.tree.map(lambda x: x[start + 1 + jnp.arange(frames)], recorded.poses)
+
+    def advance(state, pose):
+        state, look = dynamics.step(config, params, system, state, pose)
+        return state, (state, look)
+
+    return jax.lax.scan(advance, state, poses)[1]
+
+
+def total(config: SmadConfig, found: dict[str, Float[Array, "..."]], data: float = 1.0) -> tuple[Array, Metrics]:
+    """The sum of the means of `losses`, each with its weight, and the means."""
+    settings, means = config.dynamics, {name: jnp.mean(values) for name, values in found.items()}
+    weights = {"data": data, "target": settings.target, "isometry": settings.isometry, "damping": settings.damping}
+    return jnp.sum(jnp.stack([weights[name] * value for name, value in means.items()])), means
 
 
 def _train_target(config: SmadConfig, system: System, recorded: Recorded, run: Run) -> Params:
