@@ -28,7 +28,12 @@ def tiny():
         hull=dataclasses.replace(CI.hull, resolution=32, fraction=0.8, gaussians=200),
         refine=dataclasses.replace(CI.refine, steps=4),
         graph=GraphConfig(60, 4),
-        dynamics=DynamicsConfig(frames=3, target_stage=StageConfig(3, 4, 1e-3), stage=StageConfig(4, 2, 1e-3)),
+        dynamics=DynamicsConfig(
+            frames=3,
+            target_stage=StageConfig(3, 4, 1e-3),
+            stage=StageConfig(4, 2, 1e-3),
+            picture_stage=StageConfig(2, 2, 1e-3),
+        ),
     )
 
 

@@ -15,17 +15,17 @@ from experiments import unica as experiment
 from experiments.tables import __main__ as tables
 from experiments.tables import figures, quality
 from experiments.tables.finished import Finished
-from tests.unica.conftest import TINY
 
+CI = configs.preset("ci")
 SCRIPT = (1,) * 8 + (2,) * 8 + (0,) * 4
 
 
 def tiny():
     few = StageConfig(3, 2, 1e-3)
     return dataclasses.replace(
-        TINY,
+        CI,
         pca_components=24,
-        train_both=True,
+        upscaled=64,
         data=configs.DataConfig(
             transition_frames=105,
             held_out_frames=60,
@@ -35,8 +35,7 @@ def tiny():
             image_size=32,
             cloth_steps=6,
         ),
-        lpips_views=1,
-        lpips_network="alex",
+        views_per_step=2,
         vae_stage=few,
         unet_stage=few,
         coefficients_stage=dataclasses.replace(few, ema=0.9, batch=8),

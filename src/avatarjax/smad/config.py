@@ -153,7 +153,13 @@ def _ci() -> SmadConfig:
         deformer=DeformerConfig(
             pose_width=64, pose_embedding=32, hidden=64, message=32, decoder=(64, 32), codes=4, strain=True
         ),
-        dynamics=DynamicsConfig(frames=8, target_stage=StageConfig(2_000, 64, 3e-3), stage=StageConfig(300, 4, 1e-3)),
+        dynamics=DynamicsConfig(
+            frames=8,
+            target_stage=StageConfig(2_000, 64, 3e-3),
+            stage=StageConfig(150, 4, 1e-3),
+            picture_stage=StageConfig(200, 4, 1e-3),
+            pictures=2,
+        ),
     )
 
 

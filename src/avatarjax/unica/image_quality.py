@@ -7,6 +7,8 @@ from three true frames and the key (`next_frame_quality`); and the video of a ro
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import typing
 from collections.abc import Iterable
 
@@ -62,13 +64,19 @@ def _pose_renderer(avatar: Avatar, images: Images, refined: bool):
     cameras = cylinder_cameras(images.rgba.shape[-2])
     splat = _splat_config(avatar, images.texels[0], cameras)
 
-    @jax.jit
-    def drawn(avatar, texels, views):
-        cloud = wear(avatar, texels) if refined else wear_base(avatar, texels)
-        box = posmap.bounding_box(posmap.upscale(avatar.upscaler, texels))
-        return _draw(in_box(cloud, box), views, splat)
+    def drawn(texels, views):
+        return _posed(avatar, jnp.asarray(texels), photometric.pick_views(cameras, views), refined, splat)
 
-    return lambda texels, views: drawn(avatar, jnp.asarray(texels), photometric.pick_views(cameras, views))
+    return drawn
+
+
+@functools.partial(jax.jit, static_argnames=("refined", "splat"))
+def _posed(
+    avatar: Avatar, texels: Float[Array, "t 3"], views: Camera, refined: bool, splat: SplatConfig
+) -> Float[Array, "k h w 3"]:
+    cloud = wear(avatar, texels) if refined else wear_base(avatar, texels)
+    box = posmap.bounding_box(posmap.upscale(avatar.upscaler, texels))
+    return _draw(in_box(cloud, box), views, splat)
 
 
 def untrained_base(avatar: Avatar, images: Images) -> Avatar:
@@ -149,7 +157,9 @@ def _splat_config(avatar: Avatar, texels: Float[np.ndarray, "t 3"], cameras: Cam
     """Room for the cloud of one pose, wherever its cameras are: a box of two metres fills their pictures."""
     points, side = boxed_points(avatar.upscaler, jnp.asarray(texels))
     near = cylinder_cameras(cameras.width)
-    return photometric.splat_config(appearance.coarse_gaussians(avatar.base, points, side), near)
+    needed = photometric.splat_config(appearance.coarse_gaussians(avatar.base, points, side), near)
+    # Rounded to a power of two, so that avatars and poses share compiled programs.
+    return dataclasses.replace(needed, capacity=2 ** int(np.ceil(np.log2(needed.capacity))))
 
 
 def _seen_from(gaussians: Gaussians, place: Float[Array, "3"]) -> Gaussians:
