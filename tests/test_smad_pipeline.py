@@ -86,7 +86,7 @@ def test_a_second_run_reuses_and_a_stage_runs_anew(finished, capsys):
     args = experiment.Args(preset="ci", out=finished.parents[2], stage="dynamics")
     experiment.run_experiment(args)
     changed = {name for name, time in times().items() if time != before[name]}
-    assert changed == {"dynamics.safetensors"}
+    assert changed == {f"{stage}.safetensors" for stage in ("dynamics_target", "dynamics", "dynamics_pictures")}
     assert "report:" not in capsys.readouterr().out
 
 
