@@ -75,7 +75,7 @@ def stability(
     )
     curves = (1000 * rolled.distance, 1000 * rolled.height)
     # A rollout that lost its figure early has no trends.
-    for (name, trend), curve in zip(trends.items(), curves, strict=False):
+    for (name, trend), curve in zip(trends.items(), curves if trends else (), strict=True):
 
         def draw(axes, name=name, trend=trend, curve=curve):
             x = np.arange(len(curve))

@@ -92,12 +92,6 @@ def _decode(take: int, video: MonocularVideo, shrink: int) -> UInt8[np.ndarray, 
     return pictures
 
 
-def shrunk(takes: Footage, shrink: int) -> Footage:
-    """The same takes with pictures that are smaller by a whole factor, as `gather` would have read them."""
-    cameras = _shrunk_camera(takes.cameras, shrink)
-    return dataclasses.replace(takes, rgba=np.stack([_shrunk(x, shrink) for x in takes.rgba]), cameras=cameras)
-
-
 def _shrunk(picture: UInt8[np.ndarray, "h w c"], shrink: int) -> UInt8[np.ndarray, "k l c"]:
     height, width = (side // shrink for side in picture.shape[:2])
     blocks = picture[: height * shrink, : width * shrink].reshape(height, shrink, width, shrink, -1)
