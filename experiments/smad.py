@@ -52,6 +52,7 @@ from experiments import command_line, smad_report
 from experiments.clock import Clock
 
 STAGES = ("film", "hull", "refine", "dynamics", "report")
+TRAINED = {"refine": ("refine",), "dynamics": ("dynamics_target", "drape", "swing")}
 
 
 @dataclasses.dataclass
@@ -140,8 +141,9 @@ def prepare(args: Args) -> Experiment:
     (experiment.folder / "checkpoints").mkdir(parents=True, exist_ok=True)
     if args.stage == "film":
         shutil.rmtree(experiment.folder / "film", ignore_errors=True)
-    for path in (experiment.folder / "checkpoints").glob(f"{args.stage}*"):
-        path.unlink()
+    for stage in TRAINED.get(args.stage, ()):
+        for path in (experiment.folder / "checkpoints").glob(f"{stage}*"):
+            path.unlink()
     atomic.write_text(experiment.folder / "config.json", json.dumps(dataclasses.asdict(config), indent=2))
     return experiment
 
@@ -200,9 +202,11 @@ def learn(
         skin = skeletal.bind(shots.rig, shots.pose(0, 0), net.positions)
     tracks = [Take(driving.recorded(take.poses), refine.tracks(fitted, k)) for k, take in enumerate(takes)]
     system = train_dynamics.fit_scaling(config, net, skin, tracks)
-    params = train_dynamics.train(config, system, tracks, run)
+    # Tracks of one camera are mostly what it does not see: pictures have the last word on all that they began.
+    params = train_dynamics.train_target(config, system, train_dynamics.record(config, system, tracks), run)
     avatar = smad.Avatar(fitted.gaussians, fitted.warp.binding, system, params, config)
-    return train_pictures.train(avatar, shots, tracks, run), tracks
+    avatar = train_pictures.train_drape(avatar, shots, run)
+    return train_pictures.train_swing(avatar, shots, run), tracks
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -151,7 +151,7 @@ def _without_dynamics(avatar: smad.Avatar, poses: Pose):
     features = (driving.track(poses, config.dt) - system.scaling.pose_mean[None]) / system.scaling.pose_scale[None]
 
     def settled(frame):
-        window = features[jnp.maximum(frame - jnp.arange(config.deformer.pose_window), 0)]
+        window = features[jnp.maximum(frame - jnp.arange(config.deformer.pose_span), 0)]
         return dynamics.settled(config, avatar.params, window)
 
     return surface, surface + jax.lax.map(settled, jnp.arange(len(surface)))

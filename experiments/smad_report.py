@@ -126,7 +126,7 @@ def page(experiment: Experiment, avatar: smad.Avatar, results, shown) -> None:
         ]
         report.table("Errors of nodes, mm", ["take", "method", *regions], rows)
     report.heading("Learning")
-    for stage in ("refine", "dynamics_target", "dynamics", "dynamics_pictures"):
+    for stage in ("refine", "dynamics_target", "drape", "swing"):
         path = folder / "checkpoints" / f"{stage}.jsonl"
         pictures.plot_losses(path.with_suffix(".png"), read_metrics(path), stage)
         report.media(path.with_suffix(".png"), f"Loss of {stage}")

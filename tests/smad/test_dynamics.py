@@ -146,3 +146,41 @@ def test_without_velocities_it_still_knows_its_own(system):
 
 def test_the_pose_features_count_is_the_network_s():
     assert CONFIG.deformer.pose == driving.count(JOINTS)
+
+
+def test_nodes_are_carried_by_an_equilibrium_that_moves_and_do_not_lag_behind_it(system, quiet):
+    poses = moving(40, (0.0, 0.0, 3.0))
+    params = quiet | {"target": 0.02 * jax.random.normal(jax.random.key(4), quiet["target"].shape)}
+    state = dynamics.reset(CONFIG, params, system, first(poses))
+    for k in range(12):
+        state, _ = dynamics.step(CONFIG, params, system, state, jax.tree.map(lambda x, k=k: x[k], poses))
+        np.testing.assert_allclose(state.offset, state.equilibrium[0], atol=2e-5)
+    assert np.abs(state.equilibrium[0] - state.equilibrium[1]).max() > 1e-4
+
+
+def test_direct_changes_are_places_about_the_equilibrium_and_refine_velocities(system):
+    config = dataclasses.replace(CONFIG, motion="deltas")
+    params = random_like(dynamics.init(config, system, jax.random.key(0)), 3, 0.05)
+    start = dynamics.reset(config, params, system, first(moving(2)))
+    state, deltas = dynamics.step(config, params, system, start, first(moving(2)))
+    np.testing.assert_allclose(state.offset, state.equilibrium[0] + system.scaling.offset * deltas.position, atol=1e-6)
+    moved = (state.offset - start.offset) / config.dt
+    np.testing.assert_allclose(state.velocities[:, 0], moved + system.scaling.velocity * deltas.velocity, atol=1e-5)
+
+
+def test_without_an_equilibrium_poses_alone_say_nothing(system, quiet):
+    config = dataclasses.replace(CONFIG, equilibrium=False)
+    params = quiet | {"target": jnp.ones_like(quiet["target"])}
+    state = dynamics.reset(config, params, system, first(moving(2)))
+    np.testing.assert_array_equal(state.offset, 0.0)
+
+
+def test_a_window_of_poses_may_be_spread_out(system):
+    config = dataclasses.replace(CONFIG, deformer=dataclasses.replace(CONFIG.deformer, pose_window=3, pose_stride=4))
+    assert config.deformer.pose_span == 9
+    params = random_like(dynamics.init(config, system, jax.random.key(0)), 5, 0.1)
+    window = jax.random.normal(jax.random.key(6), (9, config.deformer.pose))
+    changed = [dynamics.settled(config, params, window.at[k].add(1.0)) for k in (4, 5)]
+    rest = dynamics.settled(config, params, window)
+    assert np.abs(changed[0] - rest).max() > 1e-3
+    np.testing.assert_array_equal(changed[1], rest)

@@ -59,3 +59,8 @@ def test_sizes_that_make_no_network_are_refused(changes, message):
 def test_a_graph_of_too_few_nodes_is_refused():
     with pytest.raises(ValueError, match="more nodes than 16"):
         GraphConfig(nodes=16)
+
+
+def test_an_unknown_motion_is_refused():
+    with pytest.raises((ValueError, jaxtyping.TypeCheckError), match="'flying'"):
+        dataclasses.replace(preset("ci"), motion="flying")

@@ -65,8 +65,8 @@ def trained(system, takes, tmp_path_factory):
 
 def test_a_state_is_what_the_recording_says(system, takes):
     recorded = train_dynamics.record(CONFIG, system, takes)
-    frame = 70 + 25
-    state = train_dynamics.state_at(CONFIG, recorded, jnp.asarray(frame))
+    frame, params = 70 + 25, dynamics.init(CONFIG, system, jax.random.key(0))
+    state = train_dynamics.state_at(CONFIG, params, recorded, jnp.asarray(frame))
     np.testing.assert_allclose(dynamics.positions(system, state), takes[1].positions[25], atol=1e-5)
     steps = np.diff(np.asarray(takes[1].positions[:26]), axis=0)[::-1] / CONFIG.dt
     np.testing.assert_allclose(np.moveaxis(np.asarray(state.velocities), 1, 0)[:12], steps[:12], atol=2e-3)
@@ -79,7 +79,8 @@ def test_a_state_is_what_the_recording_says(system, takes):
 
 def test_a_state_knows_nothing_of_the_take_before(system, takes):
     recorded = train_dynamics.record(CONFIG, system, takes)
-    state = train_dynamics.state_at(CONFIG, recorded, jnp.asarray(70))
+    params = dynamics.init(CONFIG, system, jax.random.key(0))
+    state = train_dynamics.state_at(CONFIG, params, recorded, jnp.asarray(70))
     np.testing.assert_array_equal(state.velocities, 0.0)
     np.testing.assert_array_equal(state.driven[0], state.driven[1])
     np.testing.assert_array_equal(state.window, np.broadcast_to(state.window[0], state.window.shape))

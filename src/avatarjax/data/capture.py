@@ -16,6 +16,7 @@ from scipy import ndimage
 from avatarjax import cameras, rotations
 from avatarjax.cameras import Camera
 from avatarjax.data import dressing
+from avatarjax.data.body import Rig
 from avatarjax.data.importers.monocular import Poses, write_monocular
 from avatarjax.data.mesh_renderer import MeshRenderer
 from avatarjax.data.motion.locomotion import Motion
@@ -44,6 +45,21 @@ def following_camera(roots: Float[np.ndarray, "f 3"], size: int) -> Camera:
     )
 
 
+def poses_of(rig: Rig, motion: Motion) -> Poses:
+    """A motion as it is recorded: the root's rotation apart from those of the joints."""
+    quats = np.array(motion.local_quats, np.float32)
+    root_rotation = np.asarray(rotations.to_matrix(jnp.asarray(quats[:, 0])))
+    quats[:, 0] = [1, 0, 0, 0]
+    return Poses(
+        np.asarray(rotations.to_matrix(jnp.asarray(quats))),
+        root_rotation,
+        np.asarray(motion.hips, np.float32),
+        rig.names,
+        rig.parents,
+        np.asarray(rig.heads, np.float32),
+    )
+
+
 def film(
     folder: str | os.PathLike,
     avatar: AvatarMesh,
@@ -68,17 +84,7 @@ def film(
         frames.append(renderer.render(posed, jax.tree.map(lambda x, k=k: x[k], camera)))
         if progress:
             progress(1)
-    quats = np.array(motion.local_quats, np.float32)
-    root_rotation = np.asarray(rotations.to_matrix(jnp.asarray(quats[:, 0])))
-    quats[:, 0] = [1, 0, 0, 0]
-    poses = Poses(
-        np.asarray(rotations.to_matrix(jnp.asarray(quats))),
-        root_rotation,
-        np.asarray(motion.hips, np.float32),
-        avatar.rig.names,
-        avatar.rig.parents,
-        np.asarray(avatar.rig.heads, np.float32),
-    )
+    poses = poses_of(avatar.rig, motion)
     new = folder.with_name(f".{folder.name}.new")
     shutil.rmtree(new, ignore_errors=True)
     write_monocular(new, [_on_background(f) for f in frames], [f[..., 3] > 127 for f in frames], camera, poses)

@@ -21,6 +21,7 @@ def _seeds(names: tuple[str, ...], seeds: tuple[int, ...]) -> tuple[tuple[str, i
 
 
 Aggregation = typing.Literal["mean", "adjacency"]
+Motion = typing.Literal["springs", "deltas"]
 PresetName = typing.Literal["ci", "small", "base", "paper"]
 
 
@@ -49,7 +50,8 @@ class DeformerConfig:
     """
 
     pose: int = 72  # ours: numbers of one body pose, as SMPL's 24 axis-angle joints have
-    pose_window: int = 6  # ours: frames of poses, tau + 1
+    pose_window: int = 6  # ours: poses in the window, tau + 1
+    pose_stride: int = 1  # ours: frames from one of them to the next
     pose_width: int = 256
     pose_embedding: int = 128
     velocities: int = 12  # of each node, newest first: tau_v + 1
@@ -65,7 +67,7 @@ class DeformerConfig:
     codes: int = 16  # ours: length of each Gaussian's latent code z_i; 0: none
 
     def __post_init__(self):
-        for name in ("pose", "pose_window", "pose_width", "pose_embedding", "hidden", "message"):
+        for name in ("pose", "pose_window", "pose_stride", "pose_width", "pose_embedding", "hidden", "message"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be positive")
         for name in ("velocities", "node_features", "iterations", "codes"):
@@ -76,6 +78,11 @@ class DeformerConfig:
             raise ValueError(f"unknown aggregation {self.aggregation!r}: choose one of {known}")
         if self.strain and not self.edge_features:
             raise ValueError("strain is a feature of an edge: it needs edge_features")
+
+    @property
+    def pose_span(self) -> int:
+        """Frames from the oldest to the newest pose of the window, both counted."""
+        return (self.pose_window - 1) * self.pose_stride + 1
 
     @property
     def node_inputs(self) -> int:
@@ -91,31 +98,52 @@ class DeformerConfig:
 
 @dataclasses.dataclass(frozen=True)
 class DynamicsConfig:
-    """How the dynamics are learned from tracks. All but the weights of the losses is ours.
+    """How the dynamics are learned from tracks. All is ours.
 
     target_stage: of what poses alone say of the offsets, which needs no rollouts, in frames; stage: of all, in rollouts
     of so many `frames`, which starts from there. noise: of the offsets from which rollouts start, in units of the
     offsets' spread, constant over the history. target: weight of the error of what poses alone say. isometry, damping:
-    weights of Eq. 11, means over edges and nodes. picture_stage: of training from pictures after that (Eq. 10), which
-    draws so many `pictures` of each rollout; photometric, tracks: weights of their error there, and of the tracks'.
+    weights of Eq. 11, means over edges and nodes.
+
+    The paper's weights, 0.1 and 0.01, are for sums in its own units: in units of the offsets' spread they take true
+    folds for stretch (docs/smad.md).
     """
 
     frames: int = 12
     noise: float = 0.05
     target: float = 0.5
-    isometry: float = 0.1
-    damping: float = 0.01
+    isometry: float = 0.001
+    damping: float = 0.0001
     target_stage: StageConfig = StageConfig(6_000, 64, 1e-3)
     stage: StageConfig = StageConfig(2_000, 8, 1e-3)
-    picture_stage: StageConfig = StageConfig(2_000, 4, 3e-4)
-    pictures: int = 3
-    photometric: float = 3.0
-    tracks: float = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class PicturesConfig:
+    """How they are learned from pictures. All but the photometric loss (Eq. 10) is ours.
+
+    drape_stage: of the equilibrium and the look, in frames; swing_stage: of all, in rollouts of so many `frames`, of
+    each of which so many are `drawn`. silhouette, isometry, offset: weights beside the photometric error.
+    """
+
+    drape_stage: StageConfig = StageConfig(20_000, 2, 2e-3)
+    swing_stage: StageConfig = StageConfig(2_000, 4, 3e-4)
+    frames: int = 12
+    drawn: int = 3
+    silhouette: float = 0.3
+    isometry: float = 0.03
+    offset: float = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
 class SmadConfig:
-    """A whole run."""
+    """A whole run.
+
+    motion: "springs" is Eq. 4, the Euler step of a mass-spring-damper whose acceleration the network adds to; "deltas"
+    is B.2, where the network says directly how far a node is from its equilibrium, and refines its velocity.
+    equilibrium: ours, offsets that a window of poses alone determines; without it all motion is the system's, as in the
+    paper.
+    """
 
     film: FilmConfig = FilmConfig()
     hull: HullConfig = HullConfig(resolution=256, gaussians=60_000)
@@ -123,7 +151,15 @@ class SmadConfig:
     graph: GraphConfig = GraphConfig()
     deformer: DeformerConfig = DeformerConfig()
     dynamics: DynamicsConfig = DynamicsConfig()
+    pictures: PicturesConfig = PicturesConfig()
+    motion: Motion = "springs"
+    equilibrium: bool = True
     dt: float = 1 / 30  # seconds a frame
+
+    def __post_init__(self):
+        if self.motion not in typing.get_args(Motion):
+            known = ", ".join(typing.get_args(Motion))
+            raise ValueError(f"unknown motion {self.motion!r}: choose one of {known}")
 
 
 def _small() -> SmadConfig:
@@ -156,9 +192,10 @@ def _ci() -> SmadConfig:
         dynamics=DynamicsConfig(
             frames=8,
             target_stage=StageConfig(2_000, 64, 3e-3),
-            stage=StageConfig(150, 4, 1e-3),
-            picture_stage=StageConfig(200, 4, 1e-3),
-            pictures=2,
+            stage=StageConfig(300, 4, 5e-4),
+        ),
+        pictures=PicturesConfig(
+            drape_stage=StageConfig(4_000, 2, 2e-3), swing_stage=StageConfig(100, 4, 3e-4), frames=8, drawn=2
         ),
     )
 

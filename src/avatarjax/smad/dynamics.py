@@ -1,15 +1,17 @@
 """How the nodes move: masses on springs and dampers, driven by poses, with a learned acceleration (SMAD 3.2).
 
-A node's place is that of the driven surface plus an offset o, both in the body frame. Offsets are masses on springs:
+A node's place is that of the driven surface plus an offset o = t + r, both in the body frame: t is the equilibrium
+that a window of poses alone determines, and the swing r about it is that of masses on springs:
 
-    o'' = k_i (t_i - o_i) - g_i o'_i - sum_j k_ij ((o_i - t_i) - (o_j - t_j)) - m_i s''_i + f_i
+    r'' = - k_i r_i - g_i r'_i - sum_j k_ij (r_i - r_j) - m_i s''_i + f_i
 
-The spring k_i holds a node to the driven surface, k_ij to its neighbours, g_i damps, and m_i s'' is the inertia by
+The spring k_i holds a node to its equilibrium, k_ij to its neighbours, g_i damps, and m_i s'' is the inertia by
 which cloth lags behind a surface that accelerates in the world: all learned, so that what is rigid becomes stiff and
-what is loose soft (Eqs. 2 and 3, with the external force split into what drives). t is a target that a window of poses
-alone determines, and f what the deformation network adds. One explicit Euler step (Eq. 4) a frame; the constants are
-bounded so that the system without f is stable at any weights. The paper's springs are between nodes alone, and its
-network predicts all of the motion: such rollouts drifted or diverged in our prototype.
+what is loose soft (Eqs. 2 and 3, with the external force split into what drives). f is what the deformation network
+adds. One explicit Euler step (Eq. 4) a frame; the constants are bounded so that the system without f is stable at any
+weights. Without inertia and f nothing swings, and o is t: dynamics can only add to what poses explain. The paper's
+springs are between nodes alone, and its network predicts all of the motion: such rollouts drifted or diverged in our
+prototype. `motion="deltas"` is B.2 instead, where the network's changes are no forces but places.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from avatarjax.smad.driving import Pose
 from avatarjax.smad.graph import Graph
 from avatarjax.smad.skeletal import Skin
 
-# Numbers of a node beside its place and velocities: at rest, offset, way to the target, the surface's motion.
+# Numbers of a node beside its place and velocities: at rest, offset, swing, the surface's motion.
 NODE_FEATURES = 15
 
 # Bounds of k_i, of the sum of a node's k_ij, and of g_i, each per unit of mass, in SI units. At 30 frames a second
@@ -70,11 +72,12 @@ class System:
 @flax.struct.dataclass
 class State:
     """offset (n, 3) of each node from the driven surface in the body frame, metres; velocities (n, v, 3) of it, newest
-    first, metres a second, v at least 1; driven (2, n, 3) the driven surface in the world, newest first; window (w, p)
-    normalised pose features, newest first; the last pose."""
+    first, metres a second, v at least 1; equilibrium (2, n, 3) of the offset and driven (2, n, 3) the driven surface in
+    the world, newest first; window (w, p) normalised pose features, newest first; the last pose."""
 
     offset: Float[Array, "n 3"]
     velocities: Float[Array, "n v 3"]
+    equilibrium: Float[Array, "2 n 3"]
     driven: Float[Array, "2 n 3"]
     window: Float[Array, "w p"]
     pose: Pose
@@ -87,7 +90,8 @@ def sized(config: SmadConfig, joints: int) -> SmadConfig:
 
 
 def init(config: SmadConfig, system: System, key: Key[Array, ""]) -> Params:
-    """Fresh parameters: a stiff, well damped system without inertia, a target and a network that add nothing."""
+    """Fresh parameters: a stiff, well damped system without inertia, an equilibrium of no offset, a network that adds
+    nothing."""
     nodes, embedding = len(system.graph.positions), config.deformer.pose_embedding
     return {
         "deformer": deformer.init(config.deformer, system.graph, key),
@@ -123,7 +127,9 @@ def driven(system: System, pose: Pose) -> Float[Array, "n 3"]:
 
 def settled(config: SmadConfig, params: Params, window: Float[Array, "w p"]) -> Float[Array, "n 3"]:
     """The offset that a window of poses alone determines: a linear reading of the network's own embedding of it."""
-    embedding = deformer.embed(config.deformer, params["deformer"], window)
+    if not config.equilibrium:
+        return jnp.zeros(params["target"].shape[1:])
+    embedding = deformer.embed(config.deformer, params["deformer"], window[:: config.deformer.pose_stride])
     return jnp.tensordot(embedding, params["target"], 1)
 
 
@@ -131,10 +137,10 @@ def reset(config: SmadConfig, params: Params, system: System, pose: Pose) -> Sta
     """Standing still in a pose, the cloth where that pose alone would have it."""
     surface = driving.to_world(pose, driven(system, pose))
     features = _normalised(system, driving.features(pose, pose, config.dt))
-    window = jnp.repeat(features[None], config.deformer.pose_window, axis=0)
+    window = jnp.repeat(features[None], config.deformer.pose_span, axis=0)
     still = jnp.zeros((len(surface), max(config.deformer.velocities, 1), 3))
     offset = settled(config, params, window)
-    return State(offset, still, jnp.stack([surface, surface]), window, pose)
+    return State(offset, still, jnp.stack([offset, offset]), jnp.stack([surface, surface]), window, pose)
 
 
 def step(config: SmadConfig, params: Params, system: System, state: State, pose: Pose) -> tuple[State, deformer.Deltas]:
@@ -150,27 +156,34 @@ def step(config: SmadConfig, params: Params, system: System, state: State, pose:
     # How the surface accelerates in the world, seen in the body frame: a second difference, which is late by a frame.
     lurch = _turned(pose, world - 2 * state.driven[0] + state.driven[1]) / config.dt**2
     sweep = _turned(pose, world - state.driven[0]) / config.dt
-    target = settled(config, params, window)
-
-    inputs = [system.graph.positions, state.offset / scaling.offset, (target - state.offset) / scaling.offset]
+    equilibrium = jnp.concatenate([settled(config, params, window)[None], state.equilibrium])
+    swing = state.offset - equilibrium[1]
+    inputs = [system.graph.positions, state.offset / scaling.offset, swing / scaling.offset]
     inputs += [sweep, lurch / scaling.drive]
     deltas = deformer.deform(
         net,
         params["deformer"],
         system.graph,
-        window,
+        window[:: net.pose_stride],
         surface + state.offset,
         state.velocities[:, : net.velocities] / scaling.velocity,
         jnp.concatenate(inputs, axis=1),
     )
-    between, anchor = springs(params, system.graph)
-    force = -anchor[:, None] * (state.offset - target) - params["inertia"][:, None] * lurch
-    force = force + scaling.acceleration * deltas.position
-    velocity = state.velocities[:, 0]
-    acceleration = msd.acceleration(between, state.offset - target, velocity, force)
-    offset, velocity = msd.euler_step(state.offset, velocity, acceleration, config.dt)
+    if config.motion == "deltas":
+        offset = equilibrium[0] + scaling.offset * deltas.position
+        velocity = (offset - state.offset) / config.dt + scaling.velocity * deltas.velocity
+    else:
+        between, anchor = springs(params, system.graph)
+        # The swing is about an equilibrium that itself moves and accelerates.
+        swinging = state.velocities[:, 0] - (equilibrium[1] - equilibrium[2]) / config.dt
+        carried = (equilibrium[0] - 2 * equilibrium[1] + equilibrium[2]) / config.dt**2
+        force = -anchor[:, None] * swing - params["inertia"][:, None] * lurch
+        force = force + scaling.acceleration * deltas.position
+        acceleration = msd.acceleration(between, swing, swinging, force) + carried
+        offset, velocity = msd.euler_step(state.offset, state.velocities[:, 0], acceleration, config.dt)
     velocities = jnp.concatenate([velocity[:, None], state.velocities[:, :-1]], axis=1)
-    return State(offset, velocities, jnp.stack([world, state.driven[0]]), window, pose), deltas
+    driven_now = jnp.stack([world, state.driven[0]])
+    return State(offset, velocities, equilibrium[:2], driven_now, window, pose), deltas
 
 
 def positions(system: System, state: State) -> Float[Array, "n 3"]:

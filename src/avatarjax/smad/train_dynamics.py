@@ -104,17 +104,46 @@ def record(config: SmadConfig, system: System, takes: Sequence[Take]) -> Recorde
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
-def state_at(config: SmadConfig, recorded: Recorded, frame: Int[Array, ""]) -> State:
+def state_at(config: SmadConfig, params: Params, recorded: Recorded, frame: Int[Array, ""]) -> State:
     """The state that the recording was in; before a take began, it is taken to have stood still."""
-    count = max(config.deformer.velocities, 1)
-    back = jnp.maximum(frame - jnp.arange(max(count + 1, config.deformer.pose_window, 2)), recorded.first[frame])
-    offsets = recorded.offsets[back[: count + 1]]
+    back = _back(config, recorded, frame)
+    equilibrium = jax.vmap(lambda window: dynamics.settled(config, params, window))(
+        _windows(config, recorded, back[:2])
+    )
+    return _state(config, recorded, back, recorded.offsets[back], equilibrium)
+
+
+def calm_at(config: SmadConfig, params: Params, recorded: Recorded, frame: Int[Array, ""]) -> State:
+    """The state of a frame as if the offsets had always been at their equilibrium, whatever was recorded."""
+    back = _back(config, recorded, frame)
+    offsets = jax.vmap(lambda window: dynamics.settled(config, params, window))(_windows(config, recorded, back))
+    return _state(config, recorded, back, offsets, offsets[:2])
+
+
+def window_at(config: SmadConfig, recorded: Recorded, frame: Int[Array, ""]) -> Float[Array, "w p"]:
+    """The window of pose features that ends in a frame; before a take began, it is taken to have stood still."""
+    return _windows(config, recorded, frame[None])[0]
+
+
+def _back(config: SmadConfig, recorded: Recorded, frame: Int[Array, ""]) -> Int[Array, "k"]:
+    """A frame and those before it that a state remembers."""
+    return jnp.maximum(frame - jnp.arange(max(config.deformer.velocities, 1) + 1), recorded.first[frame])
+
+
+def _windows(config: SmadConfig, recorded: Recorded, frames: Int[Array, "k"]) -> Float[Array, "k w p"]:
+    """The windows of pose features that end in each frame."""
+    back = frames[:, None] - jnp.arange(config.deformer.pose_span)[None]
+    return recorded.features[jnp.maximum(back, jnp.asarray(recorded.first)[frames][:, None])]
+
+
+def _state(config: SmadConfig, recorded: Recorded, back: Int[Array, "k"], offsets, equilibrium) -> State:
     return State(
         offset=offsets[0],
         velocities=jnp.swapaxes((offsets[:-1] - offsets[1:]) / config.dt, 0, 1),
-        driven=recorded.driven[back[:2]],
-        window=recorded.features[back[: config.deformer.pose_window]],
-        pose=jax.tree.map(lambda x: x[frame], recorded.poses),
+        equilibrium=equilibrium,
+        driven=jnp.asarray(recorded.driven)[back[:2]],
+        window=window_at(config, recorded, back[0]),
+        pose=jax.tree.map(lambda x: x[back[0]], recorded.poses),
     )
 
 
@@ -127,7 +156,6 @@ def losses(
     unit = system.scaling.offset
     i, j = system.graph.edges.T
     rest = jnp.linalg.norm(system.graph.positions[i] - system.graph.positions[j], axis=-1)
-    targets = jax.vmap(lambda window: dynamics.settled(config, params, window))(states.window)
 
     def stretch(state):
         edge = jnp.take(dynamics.positions(system, state), i, axis=0) - dynamics.positions(system, state)[j]
@@ -135,7 +163,7 @@ def losses(
 
     return {
         "data": jnp.mean((states.offset - offsets) ** 2) / unit**2,
-        "target": jnp.mean((targets - offsets) ** 2) / unit**2,
+        "target": jnp.mean((states.equilibrium[:, 0] - offsets) ** 2) / unit**2,
         "isometry": jnp.mean(jax.vmap(stretch)(states)) / unit**2,
         "damping": jnp.mean(states.velocities[:, :, 0] ** 2) / system.scaling.velocity**2,
     }
@@ -145,7 +173,7 @@ def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -
     """Parameters of the dynamics, learned from takes (SMAD Eq. 9 with the tracks' error for the picture's): first the
     target alone, from single frames, then all, through rollouts."""
     recorded = record(config, system, takes)
-    initial = _train_target(config, system, recorded, run)
+    initial = train_target(config, system, recorded, run)
     settings = config.dynamics
     starts, frames = rollouts(recorded, settings.frames)
 
@@ -157,7 +185,8 @@ def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -
         system, recorded = batch["system"], batch["recorded"]
 
         def one(start, key):
-            states, _ = roll(config, params, system, recorded, start, frames, key)
+            state = shaken(config, system, state_at(config, params, recorded, start), key)
+            states, _ = roll(config, params, system, recorded, state, start, frames)
             return losses(config, params, system, recorded.offsets[start + 1 + jnp.arange(frames)], states)
 
         return total(config, jax.vmap(one)(batch["start"], jax.random.split(key, len(batch["start"]))))
@@ -180,15 +209,12 @@ def roll(
     params: Params,
     system: System,
     recorded: Recorded,
+    state: State,
     start: Int[Array, ""],
     frames: int,
-    key: Key[Array, ""],
 ) -> tuple[State, Deltas]:
-    """The states of a rollout under the poses after a recorded frame, from the state there made a little wrong, and
-    what the network says of the look, both with a leading axis of `frames`."""
-    state = state_at(config, recorded, start)
-    wrong = jax.random.normal(key, state.offset.shape)
-    state = state.replace(offset=state.offset + config.dynamics.noise * system.scaling.offset * wrong)
+    """The states of a rollout under the poses after a recorded frame, from the state there, and what the network says
+    of the look, both with a leading axis of `frames`."""
     poses = jax.tree.map(lambda x: x[start + 1 + jnp.arange(frames)], recorded.poses)
 
     def advance(state, pose):
@@ -198,16 +224,24 @@ def roll(
     return jax.lax.scan(advance, state, poses)[1]
 
 
-def total(config: SmadConfig, found: dict[str, Float[Array, "..."]], data: float = 1.0) -> tuple[Array, Metrics]:
+def shaken(config: SmadConfig, system: System, state: State, key: Key[Array, ""]) -> State:
+    """The state made a little wrong."""
+    wrong = jax.random.normal(key, state.offset.shape)
+    return state.replace(offset=state.offset + config.dynamics.noise * system.scaling.offset * wrong)
+
+
+def total(config: SmadConfig, found: dict[str, Float[Array, "..."]]) -> tuple[Array, Metrics]:
     """The sum of the means of `losses`, each with its weight, and the means."""
     settings, means = config.dynamics, {name: jnp.mean(values) for name, values in found.items()}
-    weights = {"data": data, "target": settings.target, "isometry": settings.isometry, "damping": settings.damping}
+    weights = {"data": 1.0, "target": settings.target, "isometry": settings.isometry, "damping": settings.damping}
     return jnp.sum(jnp.stack([weights[name] * value for name, value in means.items()])), means
 
 
-def _train_target(config: SmadConfig, system: System, recorded: Recorded, run: Run) -> Params:
-    """Fresh parameters with a target that is learned: a hundred of these steps take the time of a rollout's."""
-    stage = config.dynamics.target_stage
+def train_target(config: SmadConfig, system: System, recorded: Recorded, run: Run) -> Params:
+    """Fresh parameters with an equilibrium that is learned: a hundred of these steps take the time of a rollout's."""
+    stage, initial = config.dynamics.target_stage, dynamics.init(config, system, run.key("dynamics"))
+    if not config.equilibrium:
+        return initial
 
     def batch_at(step):
         frames = np.random.default_rng([run.seed, step]).integers(len(recorded.first), size=stage.batch)
@@ -215,20 +249,19 @@ def _train_target(config: SmadConfig, system: System, recorded: Recorded, run: R
 
     def loss(params, key, batch):
         def missed(frame):
-            window = state_at(config, batch["recorded"], frame).window
-            return jnp.mean((dynamics.settled(config, params, window) - batch["recorded"].offsets[frame]) ** 2)
+            recorded = batch["recorded"]
+            window = window_at(config, recorded, frame)
+            return jnp.mean((dynamics.settled(config, params, window) - recorded.offsets[frame]) ** 2)
 
         return jnp.mean(jax.vmap(missed)(batch["frames"])) / batch["system"].scaling.offset ** 2, {}
 
-    return train_stage(
-        run, "dynamics_target", stage, config, loss, dynamics.init(config, system, run.key("dynamics")), batch_at
-    )
+    return train_stage(run, "dynamics_target", stage, config, loss, initial, batch_at)
 
 
 def replay(config: SmadConfig, params: Params, system: System, take: Take, start: int) -> Float[Array, "t n 3"]:
     """A rollout over the rest of a take from the state that it was in at a frame: positions (t, n, 3) in the body
     frames of the frames after it."""
-    state = state_at(config, record(config, system, [take]), jnp.asarray(start))
+    state = state_at(config, params, record(config, system, [take]), jnp.asarray(start))
     poses = jax.tree.map(lambda x: x[start + 1 :], take.poses)
     return dynamics.rollout(config, params, system, state, poses)[1]
 

@@ -1,94 +1,197 @@
-"""Learning the dynamics from pictures themselves: rollouts are drawn and compared with takes (SMAD 3.2, Eqs. 9 to 11).
+"""Learning how clothes hang and swing from the pictures themselves (SMAD 3.2, Eqs. 9 to 11).
 
-Tracks come first (`train_dynamics`), as a rollout that is far from its picture gets no gradient from it that leads
-there. Then this: one camera's tracks are right only across the view, and this loss asks for no more than that.
+First `train_drape`: the equilibrium, which is what a window of poses alone says, and the Gaussians' look, from single
+frames. All frames share it, so that a side that one frame hides is learned from others in which the person stood
+otherwise; tracks (`refine`), which belong to one frame each, are only where it starts from. Then `train_swing`:
+everything, through rollouts (Eq. 10), which begin in frames as if the clothes had always been at their equilibrium.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import typing
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from avatarjax.gaussians import Gaussians
+from avatarjax.nets.functional import Params
 from avatarjax.smad import avatar as smad
 from avatarjax.smad import dynamics, embedded, train_dynamics
 from avatarjax.smad.avatar import Avatar
 from avatarjax.smad.footage import Footage
-from avatarjax.smad.train_dynamics import Take
+from avatarjax.smad.train_dynamics import Recorded, Take
 from avatarjax.splat import SplatConfig, l1, render, required_capacity
 from avatarjax.train import Run, train_stage
+from avatarjax.train.state import Metrics
 
-# Room for Gaussians that grow or gather: so many times what those of the tracks need, in so many frames.
+# Room for Gaussians that grow or gather: so many times what those at rest need, in so many frames.
 _GROWTH, _LOOKS = 3, 16
+# Colours are learned as logits, which black and white have none of.
+_COLOR_MARGIN = 0.01
 
 
-def train(avatar: Avatar, takes: Footage, tracks: Sequence[Take], run: Run) -> Avatar:
-    """The avatar with parameters that were trained on from the pictures, the first frames of rollouts being tracks'.
+def train_drape(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
+    """The avatar with an equilibrium, colours, sizes and opacities that look like the pictures.
 
-    Of the frames of each rollout `config.dynamics.pictures` are drawn, the last and others evenly before it, over a
-    background that is drawn anew for each step; those that are held out count for nothing. Raises ValueError where
-    tracks and takes have different frames.
+    Frames that are held out are not drawn. Raises ValueError where the avatar has no equilibrium to learn.
     """
-    if [len(track.positions) for track in tracks] != list(takes.takes):
-        raise ValueError(f"tracks of {[len(x.positions) for x in tracks]} frames for takes of {takes.takes}")
-    config, settings = avatar.config, avatar.config.dynamics
-    recorded = train_dynamics.record(config, avatar.system, tracks)
-    starts, frames = train_dynamics.rollouts(recorded, settings.frames)
-    drawn = np.unique(np.linspace(frames, 0, settings.pictures, endpoint=False).round().astype(int)) - 1
-    splat = _room(avatar, takes, tracks)
+    config, settings = avatar.config, avatar.config.pictures
+    if not config.equilibrium:
+        raise ValueError("equilibrium is False: there is nothing that poses alone say")
+    recorded, splat = _recorded(avatar, takes), _room(avatar, takes)
+    frames = np.flatnonzero(~takes.held_out)
 
     def batch_at(step):
-        start = np.random.default_rng([run.seed, step]).choice(starts, settings.picture_stage.batch)
-        shown = start[:, None] + 1 + drawn[None]
-        cameras = jax.tree.map(lambda x: np.asarray(x)[shown], takes.cameras)
-        parts = {"avatar": avatar.replace(params=None), "recorded": recorded}
-        return parts | {"start": start, "cameras": cameras, "rgba": takes.rgba[shown], "counts": ~takes.held_out[shown]}
+        chosen = np.random.default_rng([run.seed, step]).choice(frames, settings.drape_stage.batch)
+        return _fixed(avatar, recorded) | _views(takes, chosen) | {"frames": chosen.astype(np.int32)}
 
     def loss(params, key, batch):
         fixed, recorded = batch["avatar"], batch["recorded"]
-        roll_key, background_key = jax.random.split(key)
-        background = jax.random.uniform(background_key, (3,))
+        look = _look(fixed.gaussians, params["look"])
 
-        def one(start, key):
-            states, looks = train_dynamics.roll(config, params, fixed.system, recorded, start, frames, key)
-            truth = recorded.offsets[start + 1 + jnp.arange(frames)]
-            chosen = jax.tree.map(lambda x: x[drawn], (states, looks))
-            nodes = jax.vmap(lambda state: dynamics.positions(fixed.system, state))(chosen[0])
-            clouds = jax.vmap(smad.dressed, in_axes=(None, 0, 0))(fixed, nodes, chosen[1])
-            return train_dynamics.losses(config, params, fixed.system, truth, states), clouds
+        def one(frame):
+            window = train_dynamics.window_at(config, recorded, frame)
+            offset = dynamics.settled(config, params["dynamics"], window)
+            pose = jax.tree.map(lambda x: x[frame], recorded.poses)
+            nodes = dynamics.driven(fixed.system, pose) + offset
+            cloud = embedded.carry(fixed.binding, look, fixed.system.graph, nodes)
+            return cloud, nodes, offset
 
-        found, clouds = jax.vmap(one)(batch["start"], jax.random.split(roll_key, len(batch["start"])))
+        clouds, nodes, offsets = jax.vmap(one)(batch["frames"])
+        return _total(avatar, key, batch, splat, clouds, nodes, offsets)
 
-        def seen(view):
-            cloud, camera, rgba = view
-            out = render(cloud, camera, background=background, config=splat)
-            rgba = rgba.astype(jnp.float32) / 255
-            wanted = rgba[..., :3] + (1 - rgba[..., 3:]) * background[None, None]
-            return l1(out.image, wanted), jnp.mean(rgba[..., 3]), out.info.dropped
+    start = {"dynamics": avatar.params, "look": _logits(avatar.gaussians)}
+    trained = train_stage(run, "drape", settings.drape_stage, config, loss, start, batch_at)
+    return avatar.replace(params=trained["dynamics"], gaussians=_look(avatar.gaussians, trained["look"]))
 
-        views = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (clouds, batch["cameras"], batch["rgba"]))
-        errors, shares, dropped = jax.lax.map(seen, views)
-        counts = batch["counts"].reshape(-1).astype(jnp.float32)
-        # The mean over the person, not the picture: a wide margin should not change what the tracks count beside it.
-        photometric = jnp.sum(counts * errors) / jnp.maximum(jnp.sum(counts * shares), 1e-3)
-        value, means = train_dynamics.total(config, found, settings.tracks)
-        means |= {"photometric": photometric, "dropped": jnp.sum(dropped).astype(jnp.float32)}
-        return value + settings.photometric * photometric, means
 
-    params = train_stage(run, "dynamics_pictures", settings.picture_stage, config, loss, avatar.params, batch_at)
+def train_swing(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
+    """The avatar with dynamics that were trained on through rollouts of `config.pictures.frames` frames.
+
+    Of each rollout `config.pictures.drawn` frames are drawn, the last and others evenly before it.
+    """
+    config, settings = avatar.config, avatar.config.pictures
+    recorded, splat = _recorded(avatar, takes), _room(avatar, takes)
+    starts, frames = train_dynamics.rollouts(recorded, settings.frames)
+    drawn = np.unique(np.linspace(frames, 0, settings.drawn, endpoint=False).round().astype(int)) - 1
+
+    def batch_at(step):
+        start = np.random.default_rng([run.seed, step]).choice(starts, settings.swing_stage.batch)
+        shown = start[:, None] + 1 + drawn[None]
+        counts = {"counts": ~takes.held_out[shown.reshape(-1)]}
+        return _fixed(avatar, recorded) | _views(takes, shown.reshape(-1)) | counts | {"start": start}
+
+    def loss(params, key, batch):
+        fixed = batch["avatar"]
+
+        def one(start):
+            state = train_dynamics.calm_at(config, params, batch["recorded"], start)
+            states, looks = train_dynamics.roll(config, params, fixed.system, batch["recorded"], state, start, frames)
+            states, looks = jax.tree.map(lambda x: x[drawn], (states, looks))
+            nodes = jax.vmap(lambda state: dynamics.positions(fixed.system, state))(states)
+            return jax.vmap(smad.dressed, in_axes=(None, 0, 0))(fixed, nodes, looks), nodes, states.offset
+
+        clouds, nodes, offsets = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(one)(batch["start"]))
+        return _total(avatar, key, batch, splat, clouds, nodes, offsets)
+
+    params = train_stage(run, "swing", settings.swing_stage, config, loss, avatar.params, batch_at)
     return avatar.replace(params=params)
 
 
-def _room(avatar: Avatar, takes: Footage, tracks: Sequence[Take]) -> SplatConfig:
-    """Room for what the tracks need, and more."""
-    positions: Float[Array, "f n 3"] = jnp.concatenate([track.positions for track in tracks])
+def _total(
+    avatar: Avatar,
+    key: Array,
+    batch: dict[str, typing.Any],
+    splat: SplatConfig,
+    clouds: Gaussians,
+    nodes: Float[Array, "k n 3"],
+    offsets: Float[Array, "k n 3"],
+) -> tuple[Float[Array, ""], Metrics]:
+    """Mean absolute errors of colours and alphas over a background that is drawn anew, mean squared stretch of edges in
+    units of their mean length (Eq. 11), and the mean square of offsets in metres; those two choose among all motions
+    that look alike to one camera."""
+    settings, graph = avatar.config.pictures, batch["avatar"].system.graph
+    background = jax.random.uniform(key, (3,))
+
+    def draw(view):
+        cloud, camera, rgba = view
+        out = render(cloud, camera, background=background, config=splat)
+        rgba = rgba.astype(jnp.float32) / 255
+        wanted = rgba[..., :3] + (1 - rgba[..., 3:]) * background[None, None]
+        return l1(out.image, wanted), l1(out.alpha[..., None], rgba[..., 3:]), out.info.dropped
+
+    photometric, silhouette, dropped = jax.lax.map(draw, (clouds, batch["cameras"], batch["rgba"]))
+    counts = batch.get("counts", jnp.ones(len(photometric))).astype(jnp.float32)
+    share = counts / jnp.maximum(jnp.sum(counts), 1.0)
+    i, j = graph.edges.T
+
+    def lengths(points):
+        return jnp.sqrt(jnp.sum((jnp.take(points, i, axis=0) - points[j]) ** 2, axis=-1) + 1e-12)
+
+    rest = lengths(graph.positions)
+    stretch = (jax.vmap(lengths)(nodes) - rest[None]) / jnp.mean(rest)
+    terms = {
+        "photometric": jnp.sum(share * photometric),
+        "silhouette": jnp.sum(share * silhouette),
+        "isometry": jnp.mean(stretch**2),
+        "offset": jnp.mean(offsets**2),
+    }
+    weights = {"photometric": 1.0} | {k: getattr(settings, k) for k in ("silhouette", "isometry", "offset")}
+    value = jnp.sum(jnp.stack([weights[name] * term for name, term in terms.items()]))
+    return value, terms | {"dropped": jnp.sum(dropped).astype(jnp.float32)}
+
+
+def _recorded(avatar: Avatar, takes: Footage) -> Recorded:
+    """The takes' poses, with nodes that are nowhere but on the driven surface."""
+    parts, first = [], 0
+    for count in takes.takes:
+        poses = jax.tree.map(lambda x, k=slice(first, first + count): x[k], takes.poses)
+        parts.append(Take(poses, _driven(avatar.system, poses)))
+        first += count
+    return train_dynamics.record(avatar.config, avatar.system, parts)
+
+
+@jax.jit
+def _driven(system, poses):
+    return jax.lax.map(lambda pose: dynamics.driven(system, pose), poses)
+
+
+def _fixed(avatar: Avatar, recorded: Recorded) -> dict[str, typing.Any]:
+    """What every batch brings along, so that it is no constant of the compiled step."""
+    return {"avatar": avatar.replace(params=None), "recorded": recorded}
+
+
+def _views(takes: Footage, frames: Int[np.ndarray, " k"]) -> dict[str, typing.Any]:
+    cameras = jax.tree.map(lambda x: np.asarray(x)[frames], takes.cameras)
+    return {"cameras": cameras, "rgba": takes.rgba[frames]}
+
+
+def _logits(gaussians: Gaussians) -> Params:
+    """What is learned of a look."""
+    colors = jnp.clip(gaussians.colors, _COLOR_MARGIN, 1 - _COLOR_MARGIN)
+    return {
+        "log_scales": gaussians.log_scales,
+        "logit_opacities": gaussians.logit_opacities,
+        "colors": jnp.log(colors / (1 - colors)),
+    }
+
+
+def _look(gaussians: Gaussians, learned: Params) -> Gaussians:
+    """The inverse of `_logits`."""
+    return gaussians.replace(**(learned | {"colors": jax.nn.sigmoid(learned["colors"])}))
+
+
+def _room(avatar: Avatar, takes: Footage) -> SplatConfig:
+    """Room for what the equilibrium needs in some frames, and more."""
     needed = 0
-    for frame in np.linspace(0, len(positions) - 1, _LOOKS).astype(int):
-        cloud = embedded.carry(avatar.binding, avatar.gaussians, avatar.system.graph, positions[frame])
-        needed = max(
-            needed, required_capacity(cloud, jax.tree.map(lambda x, k=frame: jnp.asarray(x[k]), takes.cameras))
+    for frame in np.linspace(0, len(takes.rgba) - 1, _LOOKS).astype(int):
+        pose, camera = (
+            jax.tree.map(lambda x, k=frame: jnp.asarray(x[k]), part) for part in (takes.poses, takes.cameras)
         )
+        cloud = embedded.carry(
+            avatar.binding, avatar.gaussians, avatar.system.graph, dynamics.driven(avatar.system, pose)
+        )
+        needed = max(needed, required_capacity(cloud, camera))
     return SplatConfig(capacity=min(2**24, _GROWTH * needed), depth=False)
