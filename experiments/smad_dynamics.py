@@ -253,7 +253,8 @@ def main_table(about: str, results: dict[str, list[Found]]) -> Table:
         "Where the cloth is (SMAD Tables 2, 3, J and K, in millimetres)",
         about + "Mean distance of nodes to their true places; loose are the "
         f"{measures.LOOSE:.0%} of the nodes that are furthest from their mean offset in training. Rollouts from rest; "
-        "intervals are a bootstrap over motions; p: two-sided paired t-test against ours over the motions of the test.",
+        "intervals are a bootstrap over motions; p: two-sided paired t-test against ours over the motions of the test. "
+        f"Nodes that are lost count as {measures.LOST:g} m away.",
         ["method", "test, all nodes", *(f"{part}, loose" for part in PARTS), "p"],
         rows,
     )

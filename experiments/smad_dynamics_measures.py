@@ -25,6 +25,7 @@ from experiments.smad_motions import Name
 SETTLE = 15  # frames after the start that no measure counts: a rollout begins at rest, a motion does not
 LOOSE = 0.3  # the share of nodes that count as loose
 LAGS = 10  # frames up to which a delay is looked for
+LOST = 10.0  # metres from the root beyond which a node is no further off: a rollout that diverged has an error too
 BLOCK = 30  # frames of a long sequence that are averaged, and drawn together for its trend's interval
 
 # Nodes (t, n, 3) in the body frame of every frame of a take; None where nothing is known.
@@ -83,6 +84,7 @@ def measure(
             nodes = method(name, take)
             if nodes is None:
                 continue
+            nodes = np.clip(np.nan_to_num(nodes, nan=LOST), -LOST, LOST)
             truth = np.asarray(take.positions)
             if part == "long":
                 found[part][label(name)] = long_errors(nodes, truth, chosen)
