@@ -171,6 +171,9 @@ def _small() -> SmadConfig:
         deformer=DeformerConfig(
             pose_width=128, pose_embedding=64, hidden=128, message=64, decoder=(128, 64), codes=8, strain=True
         ),
+        pictures=PicturesConfig(
+            drape_stage=StageConfig(8_000, 2, 2e-3), swing_stage=StageConfig(100, 2, 3e-4), frames=8, drawn=2
+        ),
     )
 
 
