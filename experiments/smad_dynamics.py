@@ -20,6 +20,7 @@ import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from avatarjax import smad
