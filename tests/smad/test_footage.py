@@ -92,3 +92,24 @@ def test_takes_that_do_not_go_together_are_refused(film, jointed):
     for shrink, message in ((0, "shrink is 0"), (31, "shrink 31 leaves nothing")):
         with pytest.raises(ValueError, match=message):
             footage.gather([film], shrink)
+
+
+def test_a_picture_stands_before_its_background():
+    rgba = np.zeros((2, 3, 4, 4), np.uint8)
+    rgba[1] = [51, 102, 0, 127.5]
+    found = footage.over(jnp.asarray(rgba), jnp.array([0.2, 0.4, 1.0]))
+    np.testing.assert_allclose(found[0], np.broadcast_to([0.2, 0.4, 1.0], (3, 4, 3)), atol=1e-6)
+    clear = 1 - 127 / 255
+    np.testing.assert_allclose(found[1, 0, 0], [0.2 + 0.2 * clear, 0.4 + 0.4 * clear, clear], atol=1e-6)
+
+
+def test_there_is_room_for_the_frame_that_needs_most():
+    video, _ = swaying.take(frames=10, skeleton=False)
+    takes, cloud = footage.gather([video]), swaying.doll()
+    larger = cloud.replace(log_scales=cloud.log_scales + 1)
+
+    def room(*fat, growth=1):
+        return footage.room(takes, lambda k: larger if k in fat else cloud, [3, 4], growth).capacity
+
+    assert room(4) == room(3) > room() > 0
+    assert room(7) == room() and room(growth=2) == 2 * room()

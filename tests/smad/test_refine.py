@@ -177,7 +177,7 @@ def test_held_out_frames_are_never_trained_on(small, go, whole, tmp_path):
 def test_quality_in_the_mask_is_that_of_its_pixels(small):
     begin = refine.start(small.takes, small.cloud, NET, small.takes.pose(0, 0), 3)
     found, frames = [], np.flatnonzero(small.takes.held_out)
-    room = refine._splat_config(begin, small.takes, frames, 1)
+    room = footage.room(small.takes, lambda k: refine._moved(begin, jnp.asarray(k)), frames.tolist(), growth=1)
     for frame in frames:
         camera = jax.tree.map(lambda x, k=frame: jnp.asarray(x[k]), small.takes.cameras)
         drawn = np.clip(refine._drawn(begin, jnp.asarray(frame), camera, room), 0, 1)

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Array, Bool, Float, UInt8
 
 from avatarjax.cameras import Camera
 from avatarjax.data.body import Rig
 from avatarjax.data.recording import MonocularVideo
+from avatarjax.gaussians import Gaussians
 from avatarjax.smad import driving, skeletal, views
 from avatarjax.smad.driving import Pose
+from avatarjax.splat import SplatConfig, required_capacity
 
 # One frame of so many is never trained on, the third of each group.
 HELD_OUT, _WHICH = 5, 2
+# Room for Gaussians that grow or gather: so many times what some need at the start, in so many frames.
+GROWTH, _LOOKS = 3, 16
 # Joints of one person in two takes may differ by a millimetre.
 _SAME = 1e-3
 
@@ -77,6 +81,26 @@ def gather(videos: Sequence[MonocularVideo], shrink: int = 1) -> Footage:
         rig,
         tuple(len(video) for video in videos),
     )
+
+
+def over(rgba: UInt8[Array, "*b h w 4"], background: Float[Array, "3"]) -> Float[Array, "*b h w 3"]:
+    """Pictures of the footage before a background, in 0..1."""
+    shown = rgba.astype(jnp.float32) / 255
+    return shown[..., :3] + (1 - shown[..., 3:]) * jnp.expand_dims(background, tuple(range(rgba.ndim - 1)))
+
+
+def room(
+    takes: Footage, cloud_at: Callable[[int], Gaussians], frames: Iterable[int] | None = None, growth: int = GROWTH
+) -> SplatConfig:
+    """A renderer's configuration with room for `growth` times what the clouds of some frames need, by default of a few
+    evenly spaced ones that are trained on."""
+    trained = np.flatnonzero(~takes.held_out)
+    some = trained[np.linspace(0, len(trained) - 1, _LOOKS).astype(int)].tolist()
+    needed = 0
+    for frame in some if frames is None else frames:
+        camera = jax.tree.map(lambda x, k=frame: jnp.asarray(x[k]), takes.cameras)
+        needed = max(needed, required_capacity(cloud_at(frame), camera))
+    return SplatConfig(capacity=min(2**24, growth * needed), depth=False)
 
 
 def _decode(take: int, video: MonocularVideo, shrink: int) -> UInt8[np.ndarray, "f h w 4"]:

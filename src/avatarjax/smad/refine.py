@@ -23,20 +23,19 @@ from avatarjax.cameras import Camera
 from avatarjax.gaussians import Gaussians
 from avatarjax.metrics import image, lpips
 from avatarjax.nets.functional import Params
+from avatarjax.smad import footage
 from avatarjax.smad import graph as graphs
 from avatarjax.smad import warp as warps
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.footage import Footage
 from avatarjax.smad.graph import Graph
 from avatarjax.smad.warp import Warp
-from avatarjax.splat import SplatConfig, l1, render, required_capacity
+from avatarjax.splat import SplatConfig, l1, render
 from avatarjax.train import fit, make_step, new_state, weights
 from avatarjax.train.state import Metrics
 
 # Colours are learned as logits, which black and white have none of.
 _COLOR_MARGIN = 0.01
-# Room for Gaussians that grow: so many times what the first cloud needs, in so many frames.
-_GROWTH, _LOOKS = 3, 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +144,7 @@ def refine(
     order_key, step_key = jax.random.split(key)
     begin = start(takes, gaussians, graph, canonical, config.knot)
     frames = np.flatnonzero(~takes.held_out)
-    splat = _splat_config(begin, takes, frames[np.linspace(0, len(frames) - 1, _LOOKS).astype(int)], _GROWTH)
+    splat = footage.room(takes, lambda frame: _moved(begin, jnp.asarray(frame)))
     middle = float(jnp.median(gaussians.log_scales))
     near = min(config.neighbours, len(gaussians) - 1)
     edges = graphs.build(np.asarray(gaussians.means), near).edges
@@ -187,9 +186,8 @@ def loss(
         return out.image, out.alpha, out.info.dropped
 
     images, alphas, dropped = jax.lax.map(draw, (clouds, batch.cameras))
-    rgba = batch.rgba.astype(jnp.float32) / 255
-    truth = rgba[..., :3] + (1 - rgba[..., 3:]) * background[None, None, None]
-    photometric, silhouette = l1(images, truth), l1(alphas[..., None], rgba[..., 3:])
+    photometric = l1(images, footage.over(batch.rgba, background))
+    silhouette = l1(alphas[..., None], batch.rgba[..., 3:].astype(jnp.float32) / 255)
     rest = _lengths(refined.gaussians.means, batch.edges)
     stretch = (jax.vmap(_lengths, in_axes=(0, None))(clouds.means, batch.edges) - rest[None]) / jnp.mean(rest)
     away = jax.vmap(lambda frame: warps.offsets(refined.warp, frame))(batch.frames)
@@ -215,7 +213,7 @@ def quality(refined: Refined, takes: Footage, perceptual: lpips.Network | None =
     frames = np.flatnonzero(takes.held_out & (takes.rgba[..., 3] > 127).any((1, 2)))
     if not len(frames):
         raise ValueError(f"takes of {takes.takes} frames have none to hold out with a person in it: give longer ones")
-    splat = _splat_config(refined, takes, frames, 1)
+    splat = footage.room(takes, lambda frame: _moved(refined, jnp.asarray(frame)), frames.tolist(), growth=1)
     found = []
     for frame in frames:
         camera = jax.tree.map(lambda x, k=frame: jnp.asarray(x[k]), takes.cameras)
@@ -240,24 +238,31 @@ def optimiser(config: RefineConfig) -> optax.GradientTransformation:
     return optax.multi_transform({name: adam(name) for name in names}, {name: name for name in names})
 
 
-def _parameters(refined: Refined) -> Params:
-    """What is trained. Colours are logits there."""
-    cloud, colors = refined.gaussians, jnp.clip(refined.gaussians.colors, _COLOR_MARGIN, 1 - _COLOR_MARGIN)
+def encode(gaussians: Gaussians) -> Params:
+    """What is learned of Gaussians: their own numbers, and logits of their colours."""
+    colors = jnp.clip(gaussians.colors, _COLOR_MARGIN, 1 - _COLOR_MARGIN)
     return {
-        "means": cloud.means,
-        "log_scales": cloud.log_scales,
-        "quats": cloud.quats,
-        "logit_opacities": cloud.logit_opacities,
+        "means": gaussians.means,
+        "log_scales": gaussians.log_scales,
+        "quats": gaussians.quats,
+        "logit_opacities": gaussians.logit_opacities,
         "colors": jnp.log(colors / (1 - colors)),
-        "warp": refined.warp.offsets,
     }
+
+
+def decode(learned: Params) -> Gaussians:
+    """The inverse of `encode`."""
+    return Gaussians(**(learned | {"colors": jax.nn.sigmoid(learned["colors"])}))
+
+
+def _parameters(refined: Refined) -> Params:
+    return encode(refined.gaussians) | {"warp": refined.warp.offsets}
 
 
 def _assemble(params: Params, fixed: Warp) -> Refined:
     """The inverse of `_parameters`, with the parts of the warp that are not trained."""
-    cloud = {k: params[k] for k in ("means", "log_scales", "quats", "logit_opacities")}
-    gaussians = Gaussians(**cloud, colors=jax.nn.sigmoid(params["colors"]))
-    return Refined(gaussians, fixed.replace(offsets=params["warp"]))
+    learned = {name: value for name, value in params.items() if name != "warp"}
+    return Refined(decode(learned), fixed.replace(offsets=params["warp"]))
 
 
 def _in_range(new: Params, old: Params, batch: FrameBatch) -> Params:
@@ -275,15 +280,6 @@ def _chosen(frames: Int[np.ndarray, " f"], count: int, seed: int, step: int) -> 
     rounds, places = np.divmod(step * count + np.arange(count), len(frames))
     orders = {r: np.random.default_rng((seed, r)).permutation(frames) for r in set(rounds.tolist())}
     return np.array([orders[r][place] for r, place in zip(rounds.tolist(), places, strict=True)])
-
-
-def _splat_config(refined: Refined, takes: Footage, frames: Int[np.ndarray, " k"], growth: int) -> SplatConfig:
-    """Room for `growth` times what some frames need."""
-    needed = 0
-    for frame in frames:
-        camera = jax.tree.map(lambda x, k=frame: jnp.asarray(x[k]), takes.cameras)
-        needed = max(needed, required_capacity(_moved(refined, jnp.asarray(frame)), camera))
-    return SplatConfig(capacity=min(2**24, growth * needed), depth=False)
 
 
 @jax.jit

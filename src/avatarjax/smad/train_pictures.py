@@ -18,18 +18,15 @@ from jaxtyping import Array, Float, Int
 from avatarjax.gaussians import Gaussians
 from avatarjax.nets.functional import Params
 from avatarjax.smad import avatar as smad
-from avatarjax.smad import dynamics, embedded, train_dynamics
+from avatarjax.smad import dynamics, embedded, footage, refine, train_dynamics
 from avatarjax.smad.avatar import Avatar
 from avatarjax.smad.footage import Footage
 from avatarjax.smad.train_dynamics import Recorded, Take
-from avatarjax.splat import SplatConfig, l1, render, required_capacity
+from avatarjax.splat import SplatConfig, l1, render
 from avatarjax.train import Run, train_stage
 from avatarjax.train.state import Metrics
 
-# Room for Gaussians that grow or gather: so many times what those at rest need, in so many frames.
-_GROWTH, _LOOKS = 3, 16
-# Colours are learned as logits, which black and white have none of.
-_COLOR_MARGIN = 0.01
+LOOK = ("log_scales", "logit_opacities", "colors")  # what is learned of the Gaussians, beside where they are
 
 
 def train_drape(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
@@ -49,22 +46,23 @@ def train_drape(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
 
     def loss(params, key, batch):
         fixed, recorded = batch["avatar"], batch["recorded"]
-        look = _look(fixed.gaussians, params["look"])
+        gaussians = _with_look(fixed.gaussians, params["look"])
 
         def one(frame):
             window = train_dynamics.window_at(config, recorded, frame)
             offset = dynamics.settled(config, params["dynamics"], window)
             pose = jax.tree.map(lambda x: x[frame], recorded.poses)
             nodes = dynamics.driven(fixed.system, pose) + offset
-            cloud = embedded.carry(fixed.binding, look, fixed.system.graph, nodes)
+            cloud = embedded.carry(fixed.binding, gaussians, fixed.system.graph, nodes)
             return cloud, nodes, offset
 
         clouds, nodes, offsets = jax.vmap(one)(batch["frames"])
         return _total(avatar, key, batch, splat, clouds, nodes, offsets)
 
-    start = {"dynamics": avatar.params, "look": _logits(avatar.gaussians)}
+    encoded = refine.encode(avatar.gaussians)
+    start = {"dynamics": avatar.params, "look": {name: encoded[name] for name in LOOK}}
     trained = train_stage(run, "drape", settings.drape_stage, config, loss, start, batch_at)
-    return avatar.replace(params=trained["dynamics"], gaussians=_look(avatar.gaussians, trained["look"]))
+    return avatar.replace(params=trained["dynamics"], gaussians=_with_look(avatar.gaussians, trained["look"]))
 
 
 def train_swing(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
@@ -118,9 +116,8 @@ def _total(
     def draw(view):
         cloud, camera, rgba = view
         out = render(cloud, camera, background=background, config=splat)
-        rgba = rgba.astype(jnp.float32) / 255
-        wanted = rgba[..., :3] + (1 - rgba[..., 3:]) * background[None, None]
-        return l1(out.image, wanted), l1(out.alpha[..., None], rgba[..., 3:]), out.info.dropped
+        silhouette = l1(out.alpha[..., None], rgba[..., 3:].astype(jnp.float32) / 255)
+        return l1(out.image, footage.over(rgba, background)), silhouette, out.info.dropped
 
     photometric, silhouette, dropped = jax.lax.map(draw, (clouds, batch["cameras"], batch["rgba"]))
     counts = batch.get("counts", jnp.ones(len(photometric))).astype(jnp.float32)
@@ -168,30 +165,16 @@ def _views(takes: Footage, frames: Int[np.ndarray, " k"]) -> dict[str, typing.An
     return {"cameras": cameras, "rgba": takes.rgba[frames]}
 
 
-def _logits(gaussians: Gaussians) -> Params:
-    """What is learned of a look."""
-    colors = jnp.clip(gaussians.colors, _COLOR_MARGIN, 1 - _COLOR_MARGIN)
-    return {
-        "log_scales": gaussians.log_scales,
-        "logit_opacities": gaussians.logit_opacities,
-        "colors": jnp.log(colors / (1 - colors)),
-    }
-
-
-def _look(gaussians: Gaussians, learned: Params) -> Gaussians:
-    """The inverse of `_logits`."""
-    return gaussians.replace(**(learned | {"colors": jax.nn.sigmoid(learned["colors"])}))
+def _with_look(gaussians: Gaussians, look: Params) -> Gaussians:
+    return refine.decode(refine.encode(gaussians) | look)
 
 
 def _room(avatar: Avatar, takes: Footage) -> SplatConfig:
-    """Room for what the equilibrium needs in some frames, and more."""
-    needed = 0
-    for frame in np.linspace(0, len(takes.rgba) - 1, _LOOKS).astype(int):
-        pose, camera = (
-            jax.tree.map(lambda x, k=frame: jnp.asarray(x[k]), part) for part in (takes.poses, takes.cameras)
-        )
-        cloud = embedded.carry(
-            avatar.binding, avatar.gaussians, avatar.system.graph, dynamics.driven(avatar.system, pose)
-        )
-        needed = max(needed, required_capacity(cloud, camera))
-    return SplatConfig(capacity=min(2**24, _GROWTH * needed), depth=False)
+    """Room for what skinning needs, and more."""
+
+    def cloud_at(frame):
+        pose = jax.tree.map(lambda x: jnp.asarray(x[frame]), takes.poses)
+        nodes = dynamics.driven(avatar.system, pose)
+        return embedded.carry(avatar.binding, avatar.gaussians, avatar.system.graph, nodes)
+
+    return footage.room(takes, cloud_at)
