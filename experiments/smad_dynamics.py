@@ -65,6 +65,11 @@ def _nodes(config: SmadConfig, times: float) -> SmadConfig:
     return dataclasses.replace(config, graph=dataclasses.replace(config.graph, nodes=round(times * config.graph.nodes)))
 
 
+def _longer(config: SmadConfig, times: int) -> SmadConfig:
+    stage = config.dynamics.target_stage
+    return _losses(config, target_stage=dataclasses.replace(stage, steps=times * stage.steps))
+
+
 def _base(config: SmadConfig) -> SmadConfig:
     """A0: the network says where nodes are, from the state and the poses; no edge features, no learned k_ij, and no
     losses but the data's."""
@@ -97,6 +102,7 @@ LEARNED: dict[str, Callable[[SmadConfig], SmadConfig]] = {
     "B3 tau_v = 15": lambda c: _net(c, velocities=16),
     "C1 half the nodes": lambda c: _nodes(c, 0.5),
     "C3 twice the nodes": lambda c: _nodes(c, 2.0),
+    "equilibrium 4 times as long": lambda c: _longer(c, 4),
     "isometry 0": lambda c: _losses(c, isometry=0.0),
     "isometry 0.1": lambda c: _losses(c, isometry=0.1),
     "damping 0": lambda c: _losses(c, damping=0.0),
