@@ -44,7 +44,7 @@ from avatarjax.smad import (
     train_dynamics,
     train_pictures,
 )
-from avatarjax.smad.config import SmadConfig
+from avatarjax.smad.config import FilmConfig, SmadConfig
 from avatarjax.smad.refine import Refined
 from avatarjax.smad.train_dynamics import Take
 from avatarjax.train import Run
@@ -156,6 +156,7 @@ def film(experiment: Experiment) -> dict[str, list[MonocularVideo]]:
             "train": [load_monocular(path).held() for path in args.videos],
             "test": [load_monocular(path).held() for path in args.test],
         }
+    keep_films(experiment.folder / "film", wanted)
     avatar = None
     takes: dict[str, list[MonocularVideo]] = {}
     for part in ("train", "test", "unseen"):
@@ -170,6 +171,16 @@ def film(experiment: Experiment) -> dict[str, list[MonocularVideo]]:
                     capture.film(folder, avatar, motion, size=wanted.size, config=config, progress=bar.update)
             takes[part].append(load_monocular(folder).held())
     return takes
+
+
+def keep_films(folder: Path, wanted: FilmConfig) -> None:
+    """Films of other settings are deleted, with a word; those of the same are kept."""
+    settings, path = json.dumps({"size": wanted.size, "substeps": wanted.substeps}), folder / "settings.json"
+    if folder.exists() and (not path.is_file() or path.read_text() != settings):
+        print(f"deleting films of other settings in {folder}")
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    atomic.write_text(path, settings)
 
 
 def fingerprint(takes: Sequence[MonocularVideo]) -> str:

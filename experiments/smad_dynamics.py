@@ -14,6 +14,7 @@ dynamics.md, dynamics.json and plots. A second run reuses what is finished, an i
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
 import typing
@@ -167,17 +168,16 @@ def one(
     name: str,
     seed: int,
 ) -> dict[str, Found]:
-    """Train and measure a method, and with ours all yardsticks; what was measured before is read back."""
-    path = place / "measures.json"
-    if path.is_file():
-        return json.loads(path.read_text())
+    """Train and measure a method, and with ours all yardsticks; what was measured of the same is read back."""
+    path, mark = place / "measures.json", fingerprint(config, stage, seed)
+    if path.is_file() and (known := json.loads(path.read_text())).get("mark") == mark:
+        return known["found"]
     print(f"{name}, seed {seed}", flush=True)
     graph, skin, chosen = stage.nodes(config.graph)
     parts = {part: {n: on_nodes(take, chosen) for n, take in found.items()} for part, found in takes.items()}
     learned = list(parts["train"].values())
     config = dynamics.sized(config, learned[0].poses.rotations.shape[1])
     system = train_dynamics.fit_scaling(config, graph, skin, learned)
-    mark = f"{stage.name} {stage.config} {sorted(takes['train'])}"
     params = train_dynamics.train(config, system, learned, Run(place, seed, mark))
     recorded = train_dynamics.record(config, system, learned)
     methods: dict[str, Method] = {name: measures.of_avatar(config, params, system)}
@@ -187,11 +187,16 @@ def one(
     loose = measures.loose(np.asarray(recorded.offsets))
     skinned = measures.of_skinning(system)
     found = {label: measures.measure(method, parts, loose, skinned) for label, method in methods.items()}
-    atomic.write_text(path, json.dumps(found))
+    atomic.write_text(path, json.dumps({"mark": mark, "found": found}))
     if name == OURS:
         show = next(iter(parts["test"]))
         measures.draw_nodes(place.parent.parent / "nodes.png", methods, parts["test"][show], show, (OURS, SKINNING))
     return found
+
+
+def fingerprint(config: SmadConfig, stage: Stage, seed: int) -> str:
+    """What tells a measurement from others."""
+    return hashlib.sha256(f"{config} {stage.name} {stage.config} {MOTIONS} {seed}".encode()).hexdigest()[:12]
 
 
 def yardsticks(config: SmadConfig, params: typing.Any, system: System, recorded: typing.Any) -> dict[str, Method]:

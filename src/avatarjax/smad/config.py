@@ -98,7 +98,8 @@ class DeformerConfig:
 
 @dataclasses.dataclass(frozen=True)
 class DynamicsConfig:
-    """How the dynamics are learned from tracks. All is ours.
+    """How the dynamics are learned from tracks; from those of videos the equilibrium alone, and the rest from pictures
+    (`PicturesConfig`). All is ours.
 
     target_stage: of what poses alone say of the offsets, which needs no rollouts, in frames; stage: of all, in rollouts
     of so many `frames`, which starts from there. noise: of the offsets from which rollouts start, in units of the
