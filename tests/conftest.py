@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jaxtyping
 
-# Most of a run is compiling, a quarter of it by the emitters of fused loops. What they make runs faster, but rarely here.
+# Most of a run is compiling, a quarter of it by the emitters of fused loops, whose faster code most tests run but once.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
 
 # Before anything imports avatarjax: check the shape annotations of every function of the package with beartype.
