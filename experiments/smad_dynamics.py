@@ -30,7 +30,7 @@ from avatarjax.io import atomic
 from avatarjax.metrics import environment, published
 from avatarjax.metrics.statistics import Estimate, bootstrap, paired_t_test
 from avatarjax.smad import dynamics, linear, train_dynamics
-from avatarjax.smad.config import DynamicsConfig, SmadConfig
+from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.dynamics import System
 from avatarjax.smad.train_dynamics import Take
 from avatarjax.train import Run
@@ -71,16 +71,10 @@ def _longer(config: SmadConfig, times: int) -> SmadConfig:
     return _losses(config, target_stage=dataclasses.replace(stage, steps=times * stage.steps))
 
 
-def _base(config: SmadConfig) -> SmadConfig:
-    """A0: the network says where nodes are, from the state and the poses; no edge features, no learned k_ij, and no
-    losses but the data's."""
-    config = _net(config, edge_features=False, strain=False, adaptive_stiffness=False)
-    return dataclasses.replace(_losses(config, isometry=0.0, damping=0.0), motion="deltas", equilibrium=False)
-
-
 def _regular(config: SmadConfig) -> SmadConfig:
-    ours = DynamicsConfig()
-    return _losses(_base(config), isometry=ours.isometry, damping=ours.damping)
+    """A1: the network says where nodes are, from the state and the poses; no edge features, no learned k_ij."""
+    config = _net(config, edge_features=False, strain=False, adaptive_stiffness=False)
+    return dataclasses.replace(config, motion="deltas", equilibrium=False)
 
 
 def _edges(config: SmadConfig) -> SmadConfig:
@@ -92,7 +86,7 @@ LEARNED: dict[str, Callable[[SmadConfig], SmadConfig]] = {
     OURS: lambda c: c,
     "MLP": lambda c: _net(c, iterations=0),
     "vanilla GNN": lambda c: _net(c, edge_features=False, strain=False, adaptive_stiffness=False),
-    "A0 base": _base,
+    "A0 base": lambda c: _losses(_regular(c), isometry=0.0, damping=0.0),
     "A1 + losses": _regular,
     "A2 + learned k_ij": lambda c: _net(_regular(c), adaptive_stiffness=True),
     "A3 + edge features": _edges,

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from avatarjax.metrics import drift, motion
 from avatarjax.nets.functional import Params
-from avatarjax.smad import dynamics, linear, train_dynamics
+from avatarjax.smad import dynamics, linear
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.dynamics import System
 from avatarjax.smad.linear import Linear
@@ -52,7 +52,7 @@ def of_avatar(config: SmadConfig, params: Params, system: System) -> Method:
 
 def of_equilibrium(config: SmadConfig, params: Params, system: System) -> Method:
     """What a window of poses alone says."""
-    return lambda _, take: np.asarray(_equilibrium(config, params, system, take.poses))
+    return lambda _, take: np.asarray(dynamics.without_swing(config, params, system, take.poses)[1])
 
 
 def of_linear(config: SmadConfig, model: Linear, system: System) -> Method:
@@ -188,15 +188,3 @@ def _linear(config, model, system, poses):
 @jax.jit
 def _driven(system, poses):
     return jax.lax.map(lambda pose: dynamics.driven(system, pose), poses)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _equilibrium(config, params, system, poses):
-    take = Take(poses, _driven(system, poses))
-    recorded = train_dynamics.record(config, system, [take])
-
-    def settled(frame):
-        back = jnp.maximum(frame - jnp.arange(config.deformer.pose_span), 0)
-        return dynamics.settled(config, params, recorded.features[back])
-
-    return take.positions + jax.lax.map(settled, jnp.arange(len(take.positions)))

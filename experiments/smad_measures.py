@@ -42,7 +42,7 @@ def move(avatar: smad.Avatar, poses: Pose) -> dict[str, Moved]:
     after = jax.tree.map(lambda x: x[1:], poses)
     state = smad.reset(avatar, jax.tree.map(lambda x: x[0], poses))
     _, frames = _rollout(avatar, state, after)
-    driven, settled = _without_dynamics(avatar, poses)
+    driven, settled = dynamics.without_swing(avatar.config, avatar.params, avatar.system, poses)
     found = {"ours": Moved(lambda k: jax.tree.map(lambda x: x[k - 1], frames.gaussians), np.asarray(frames.nodes))}
     for name, nodes in (("pose window alone", settled[1:]), ("skinning", driven[1:])):
         dressed = functools.partial(_dressed, avatar, nodes, after)
@@ -105,7 +105,7 @@ def loose_nodes(avatar: smad.Avatar, truths: list[np.ndarray], poses: list[Pose]
     """The nodes that skinning is furthest from on takes that were trained on."""
     apart = []
     for truth, pose in zip(truths, poses, strict=True):
-        driven = np.asarray(_without_dynamics(avatar, pose)[0])
+        driven = np.asarray(dynamics.without_swing(avatar.config, avatar.params, avatar.system, pose)[0])
         offset = truth - driven
         # Nodes lie a little beside the vertices that stand for them: what counts is how that changes.
         apart.append(np.linalg.norm(offset - offset.mean(0), axis=-1))
@@ -141,20 +141,6 @@ def _rollout(avatar, state, poses):
 @jax.jit
 def _dressed(avatar, nodes, poses, frame):
     return wear(avatar, nodes[frame - 1], jax.tree.map(lambda x: x[frame - 1], poses))
-
-
-@jax.jit
-def _without_dynamics(avatar: smad.Avatar, poses: Pose):
-    """The driven surface, and that with the offsets that a window of poses alone determines, (t, n, 3) each."""
-    config, system = avatar.config, avatar.system
-    surface = jax.lax.map(lambda pose: dynamics.driven(system, pose), poses)
-    features = (driving.track(poses, config.dt) - system.scaling.pose_mean[None]) / system.scaling.pose_scale[None]
-
-    def settled(frame):
-        window = features[jnp.maximum(frame - jnp.arange(config.deformer.pose_span), 0)]
-        return dynamics.settled(config, avatar.params, window)
-
-    return surface, surface + jax.lax.map(settled, jnp.arange(len(surface)))
 
 
 @functools.partial(jax.jit, static_argnames="config")

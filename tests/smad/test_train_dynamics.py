@@ -93,7 +93,7 @@ def test_the_terms_of_the_loss_are_as_printed(system):
     states = jax.tree.map(lambda *x: jnp.stack(x), *still)
     velocities = jnp.zeros_like(states.velocities).at[:, :, 0].set(0.3)
     stretched = states.replace(offset=0.1 * jnp.asarray(POINTS, jnp.float32)[None].repeat(2, 0), velocities=velocities)
-    found = train_dynamics.losses(CONFIG, params, system, jnp.zeros((2, 16, 3)), stretched)
+    found = train_dynamics.losses(system, jnp.zeros((2, 16, 3)), stretched)
     i, j = np.asarray(system.graph.edges).T
     lengths = np.linalg.norm(POINTS[i] - POINTS[j], axis=1)
     unit = float(system.scaling.offset)

@@ -17,6 +17,7 @@ prototype. `motion="deltas"` is B.2 instead, where the network's changes are no 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import typing
 
 import flax.struct
@@ -131,6 +132,22 @@ def settled(config: SmadConfig, params: Params, window: Float[Array, "w p"]) -> 
         return jnp.zeros(params["target"].shape[1:])
     embedding = deformer.embed(config.deformer, params["deformer"], window[:: config.deformer.pose_stride])
     return jnp.tensordot(embedding, params["target"], 1)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def without_swing(
+    config: SmadConfig, params: Params, system: System, poses: Pose
+) -> tuple[Float[Array, "t n 3"], Float[Array, "t n 3"]]:
+    """The driven surface under every one of t poses, and the nodes at the equilibrium that poses alone determine, both
+    in the body frames; before the first pose the body is taken to have stood still."""
+    surface = jax.lax.map(lambda pose: driven(system, pose), poses)
+    features = (driving.track(poses, config.dt) - system.scaling.pose_mean[None]) / system.scaling.pose_scale[None]
+
+    def at(frame):
+        back = jnp.maximum(frame - jnp.arange(config.deformer.pose_span), 0)
+        return settled(config, params, features[back])
+
+    return surface, surface + jax.lax.map(at, jnp.arange(len(surface)))
 
 
 def reset(config: SmadConfig, params: Params, system: System, pose: Pose) -> State:

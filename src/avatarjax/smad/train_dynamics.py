@@ -147,9 +147,7 @@ def _state(config: SmadConfig, recorded: Recorded, back: Int[Array, "k"], offset
     )
 
 
-def losses(
-    config: SmadConfig, params: Params, system: System, offsets: Float[Array, "t n 3"], states: State
-) -> dict[str, Float[Array, ""]]:
+def losses(system: System, offsets: Float[Array, "t n 3"], states: State) -> dict[str, Float[Array, ""]]:
     """Terms of the loss of a rollout of t frames against recorded offsets: `data` and `target`, mean squared errors in
     units of the offsets' spread; `isometry`, mean squared stretch of edges, and `damping`, mean squared velocity of
     offsets (Eq. 11 as means), both in the same unit."""
@@ -187,7 +185,7 @@ def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -
         def one(start, key):
             state = shaken(config, system, state_at(config, params, recorded, start), key)
             states, _ = roll(config, params, system, recorded, state, start, frames)
-            return losses(config, params, system, recorded.offsets[start + 1 + jnp.arange(frames)], states)
+            return losses(system, recorded.offsets[start + 1 + jnp.arange(frames)], states)
 
         return total(config, jax.vmap(one)(batch["start"], jax.random.split(key, len(batch["start"]))))
 
