@@ -122,6 +122,15 @@ def test_soles_are_found_and_a_dragging_hem_is_not():
     assert slack < 1e-5
 
 
+@pytest.mark.parametrize("left, right, found", [(8, 8, 8), (10, 5, 5), (4, 3, 3), (2, 8, None)])
+def test_soles_of_few_points_are_soles(left, right, found):
+    texels, roots, sequence, standing = walker()
+    texels[:, left:10, 1] += 0.1
+    texels[:, 10 + right : 20, 1] += 0.1
+    soles = stance.find_soles(texels, roots, sequence, standing)
+    assert (None if soles is None else soles[0].shape) == (None if found is None else (2, found))
+
+
 def test_a_figure_that_floats_has_no_soles():
     texels, roots, sequence, standing = walker()
     assert stance.find_soles(texels, roots + np.float32([0, 0.5, 0]), sequence, standing) is None

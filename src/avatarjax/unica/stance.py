@@ -22,10 +22,10 @@ from avatarjax.posmap import pca as pcs
 HEIGHT = 0.015
 # A foot that moves further in one frame than this, metres, swings close to the ground and does not stand.
 SWING = 0.05
-# Sole points a foot.
-POINTS = 8
-# Frames in which some sole point must be seen at rest for there to be a foot.
-SEEN = 10
+# Sole points a foot, at most and at least: of a boot under a coat few texels are seen.
+POINTS = (8, 3)
+# Frames in which some sole point must be seen at rest for there to be a foot, and the share of them for further points.
+SEEN, OFTEN = 10, 0.25
 ROOT = 3
 
 
@@ -36,7 +36,7 @@ class Stance:
 
     spread (k + 3, k + 3) is the symmetric square root of the covariance of the model's errors in a step, coefficients
     of the pose first and then the root in metres, metres and radians; slack () is how far a foot that stands moves in a
-    frame, metres.
+    frame, metres, as a standard deviation along either axis of the ground.
     """
 
     soles: Int[Array, "2 p"]
@@ -110,14 +110,17 @@ def find_soles(
     often = rests.sum(0)
     sides = []
     for side in (standing[:, 0] > 0, standing[:, 0] < 0):
-        best = np.flatnonzero(side)[np.argsort(-often[side], kind="stable")][:POINTS]
-        if len(best) < POINTS or often[best[0]] < SEEN or often[best[-1]] < 0.25 * often[best[0]]:
-            return None
-        sides.append(best)
-    soles = np.stack(sides)
+        best = np.flatnonzero(side)[np.argsort(-often[side], kind="stable")][: POINTS[0]]
+        sides.append(best[often[best] >= max(SEEN, OFTEN * often[best].max(initial=0))])
+    count = min(map(len, sides))
+    if count < POINTS[1]:
+        return None
+    soles = np.stack([best[:count] for best in sides])
     middles = np.linalg.norm((now[:, soles].mean(2) - then[:, soles].mean(2))[..., [0, 2]], axis=-1)
     standing_still = (now[:, soles, 1].min(2) < HEIGHT) & (then[:, soles, 1].min(2) < HEIGHT) & (middles < SWING)
-    return soles, float(np.median(middles[standing_still]))
+    # The deviation of which a quarter of all steps (Rayleigh's distribution) are shorter: of the longer steps many are
+    # those of feet that swing close to the ground.
+    return soles, float(np.quantile(middles[standing_still], 0.25) / np.sqrt(-2 * np.log(0.75)))
 
 
 def square_root(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
