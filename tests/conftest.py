@@ -19,9 +19,10 @@ import pytest  # noqa: E402
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 2)
-# The same programs are compiled by many modules, and anew after their caches were cleared: a run keeps them on disk.
+# The same programs are compiled by many modules, and anew after their caches were cleared: a run keeps them on disk,
+# and its worker processes, which inherit the environment, share them.
 _cache = tempfile.TemporaryDirectory(prefix="avatarjax-tests-", ignore_cleanup_errors=True)
-jax.config.update("jax_compilation_cache_dir", os.environ.get("AVATARJAX_TEST_CACHE") or _cache.name)
+jax.config.update("jax_compilation_cache_dir", os.environ.setdefault("AVATARJAX_TEST_CACHE", _cache.name))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
