@@ -212,7 +212,7 @@ def learn(
     if shots.rig is not None:
         skin = skeletal.bind(shots.rig, shots.pose(0, 0), net.positions)
     tracks = [Take(driving.recorded(take.poses), refine.tracks(fitted, k)) for k, take in enumerate(takes)]
-    system = train_dynamics.fit_scaling(config, net, skin, tracks)
+    system = train_dynamics.fit_system(config, net, skin, tracks)
     # Tracks of one camera are mostly what it does not see: pictures have the last word on all that they began.
     params = train_dynamics.train_target(config, system, train_dynamics.record(config, system, tracks), run)
     avatar = smad.Avatar(fitted.gaussians, fitted.warp.binding, system, params, config)

@@ -2,6 +2,7 @@
 
     python -m experiments.smad_dynamics --avatar cowgirl --preset ci             # every method, one seed
     python -m experiments.smad_dynamics --methods ours MLP --seeds 3             # some of them, with other seeds
+    python -m experiments.smad_dynamics --methods ours --motions 18 6 36 72      # what more motions are worth
     python -m experiments.smad_dynamics --avatar ghostlady --methods ours        # cloth that nobody can predict
 
 An avatar is simulated in motions to learn from and to measure on; nodes are points of its mesh, so that errors are in
@@ -51,6 +52,7 @@ TWINS, SKINNING, MEAN, RIDGE, SPACE, POSES, OURS = (
     "pose window alone",
     "ours",
 )
+Results = dict[str, list[Found]]  # by method, of every seed
 YARDSTICKS = (SKINNING, MEAN, RIDGE, SPACE, POSES)
 
 
@@ -97,6 +99,7 @@ LEARNED: dict[str, Callable[[SmadConfig], SmadConfig]] = {
     "B3 tau_v = 15": lambda c: _net(c, velocities=16),
     "C1 half the nodes": lambda c: _nodes(c, 0.5),
     "C3 twice the nodes": lambda c: _nodes(c, 2.0),
+    "equilibrium of the network alone": lambda c: _losses(c, components=0),
     "equilibrium 4 times as long": lambda c: _longer(c, 4),
     "isometry 0": lambda c: _losses(c, isometry=0.0),
     "isometry 0.1": lambda c: _losses(c, isometry=0.1),
@@ -117,6 +120,9 @@ class Args:
     """Learned methods; default: all. Yardsticks are always measured."""
     seeds: int = 1
     """How many seeds of training; the motions are the same for all."""
+    motions: tuple[int, ...] = (18,)
+    """How many motions to learn from: the comparison is made with the first number, and ours and the yardsticks are
+    measured with the others as well."""
     out: Path = Path("runs")
     """Folder under which results go."""
 
@@ -128,16 +134,20 @@ def run(args: Args) -> Path:
     folder = home / args.preset
     folder.mkdir(parents=True, exist_ok=True)
     stage = Stage(home / f"motions-{config.film.substeps}", args.avatar, config.film.substeps)
-    takes = {part: {name: stage.tracks(name) for name in names} for part, names in all_of(MOTIONS).items()}
-    results: dict[str, list[Found]] = {}
-    for name in wanted:
-        for seed in range(args.seeds):
-            place = folder / name.replace(" ", "_") / f"seed{seed}"
-            for method, found in one(LEARNED[name](config), stage, takes, place, name, seed).items():
-                results.setdefault(method, []).append(found)
-            # A process may hold so many memory mappings, and each method compiles programs of its own.
-            jax.clear_caches()
-        report(args, config, results, folder)
+    takes = {
+        part: {name: stage.tracks(name) for name in names}
+        for part, names in all_of(MOTIONS.learning(max(args.motions))).items()
+    }
+    results: dict[int, Results] = {}
+    for count in args.motions:
+        for name in wanted if count == args.motions[0] else (OURS,):
+            for seed in range(args.seeds):
+                place = folder / f"motions{count}" / name.replace(" ", "_") / f"seed{seed}"
+                for method, found in one(LEARNED[name](config), stage, takes, count, place, name, seed).items():
+                    results.setdefault(count, {}).setdefault(method, []).append(found)
+                # A process may hold so many memory mappings, and each method compiles programs of its own.
+                jax.clear_caches()
+            report(args, config, results, folder)
     return folder
 
 
@@ -150,6 +160,9 @@ def checked(args: Args) -> tuple[SmadConfig, tuple[str, ...]]:
     for name in args.methods:
         if name not in LEARNED:
             raise ValueError(f"unknown method {name!r}: choose of {', '.join(LEARNED)}")
+    known = len(MOTIONS.train)
+    if not args.motions or len(set(args.motions)) < len(args.motions) or not all(0 < n <= known for n in args.motions):
+        raise ValueError(f"--motions {args.motions}: give different numbers from 1 to {known}")
     # Ours first: what others are compared with.
     return smad.preset(args.preset), (OURS, *(n for n in args.methods or LEARNED if n != OURS))
 
@@ -158,26 +171,29 @@ def one(
     config: SmadConfig,
     stage: Stage,
     takes: Mapping[str, Mapping[Name, Take]],
+    count: int,
     place: Path,
     name: str,
     seed: int,
 ) -> dict[str, Found]:
-    """Train and measure a method, and with ours all yardsticks; what was measured of the same is read back."""
-    path, mark = place / "measures.json", fingerprint(config, stage, seed)
+    """Train a method on the first so many motions and measure it, and with ours all yardsticks; what was measured of
+    the same is read back."""
+    motions = MOTIONS.learning(count)
+    path, mark = place / "measures.json", fingerprint(config, stage, motions, seed)
     if path.is_file() and (known := json.loads(path.read_text())).get("mark") == mark:
         return known["found"]
-    print(f"{name}, seed {seed}", flush=True)
+    print(f"{name}, {count} motions, seed {seed}", flush=True)
     graph, skin, chosen = stage.nodes(config.graph)
-    parts = {part: {n: on_nodes(take, chosen) for n, take in found.items()} for part, found in takes.items()}
+    parts = {part: {n: on_nodes(takes[part][n], chosen) for n in names} for part, names in all_of(motions).items()}
     learned = list(parts["train"].values())
     config = dynamics.sized(config, learned[0].poses.rotations.shape[1])
-    system = train_dynamics.fit_scaling(config, graph, skin, learned)
+    system = train_dynamics.fit_system(config, graph, skin, learned)
     params = train_dynamics.train(config, system, learned, Run(place, seed, mark))
     recorded = train_dynamics.record(config, system, learned)
     methods: dict[str, Method] = {name: measures.of_avatar(config, params, system)}
     if name == OURS:
         methods |= yardsticks(config, params, system, recorded)
-        methods[TWINS] = twins(stage, chosen, MOTIONS)
+        methods[TWINS] = twins(stage, chosen, motions)
     loose = measures.loose(np.asarray(recorded.offsets))
     skinned = measures.of_skinning(system)
     found = {label: measures.measure(method, parts, loose, skinned) for label, method in methods.items()}
@@ -188,17 +204,18 @@ def one(
     return found
 
 
-def fingerprint(config: SmadConfig, stage: Stage, seed: int) -> str:
+def fingerprint(config: SmadConfig, stage: Stage, motions: Motions, seed: int) -> str:
     """What tells a measurement from others."""
-    return hashlib.sha256(f"{config} {stage.name} {stage.config} {MOTIONS} {seed}".encode()).hexdigest()[:12]
+    return hashlib.sha256(f"{config} {stage.name} {stage.config} {motions} {seed}".encode()).hexdigest()[:12]
 
 
 def yardsticks(config: SmadConfig, params: typing.Any, system: System, recorded: typing.Any) -> dict[str, Method]:
     """What needs no network, and what our network says of poses without dynamics."""
+    known = recorded.offsets, recorded.features, recorded.first
     models = {
-        MEAN: linear.fit(recorded, components=0),
-        RIDGE: linear.fit(recorded),
-        SPACE: linear.fit(recorded, lags=2),
+        MEAN: linear.fit(*known, components=0),
+        RIDGE: linear.fit(*known),
+        SPACE: linear.fit(*known, lags=2),
     }
     methods = {label: measures.of_linear(config, model, system) for label, model in models.items()}
     return methods | {
@@ -218,39 +235,59 @@ def twins(stage: Stage, chosen: np.ndarray, motions: Motions) -> Method:
     return method
 
 
-def report(args: Args, config: SmadConfig, results: dict[str, list[Found]], folder: Path) -> None:
-    """Write dynamics.json, dynamics.md and plots, and print the tables."""
+def report(args: Args, config: SmadConfig, results: dict[int, Results], folder: Path) -> None:
+    """Write dynamics.json, dynamics.md and plots, and print the tables; `results` by number of motions."""
     made_on = ", ".join(f"{key} {value}" for key, value in environment.describe().items())
     made = [table.markdown() for table in tables(args, config, results)]
-    command = (
-        f"`python -m experiments.smad_dynamics --avatar {args.avatar} --preset {args.preset} --seeds {args.seeds}`"
-    )
-    text = "\n".join([*made, f"{command} on {made_on}.", ""])
+    command = f"python -m experiments.smad_dynamics --avatar {args.avatar} --preset {args.preset}"
+    command += f" --seeds {args.seeds} --motions {' '.join(map(str, args.motions))}"
+    text = "\n".join([*made, f"`{command}` on {made_on}.", ""])
     atomic.write_text(folder / "dynamics.md", text)
     atomic.write_text(folder / "dynamics.json", json.dumps(results, indent=1))
     print(text, flush=True)
-    shown = [name for name in (SKINNING, RIDGE, OURS, "B0 no velocities") if name in results]
+    first = results[args.motions[0]]
+    shown = [name for name in (SKINNING, RIDGE, OURS, "B0 no velocities") if name in first]
     for kind in MOTIONS.long:
         label = measures.label(kind)
-        lines = {n: np.array(results[n][0]["long"][label]["curve"]) for n in shown if label in results[n][0]["long"]}
+        lines = {n: np.array(first[n][0]["long"][label]["curve"]) for n in shown if label in first[n][0]["long"]}
         x = {n: np.stack([np.arange(len(y)) * measures.BLOCK / 30, y], axis=1) for n, y in lines.items()}
         pictures.plot_lines(folder / f"long-{label}.png", x, "seconds", "error of loose nodes, mm")
 
 
-def tables(args: Args, config: SmadConfig, results: dict[str, list[Found]]) -> list[Table]:
+def tables(args: Args, config: SmadConfig, results: dict[int, Results]) -> list[Table]:
     """All tables of the results that there are."""
     steps = config.dynamics.target_stage.steps, config.dynamics.stage.steps
     about = (
-        f"{args.avatar}, {args.preset}, {config.graph.nodes} nodes; {len(MOTIONS.train)} motions to learn from; "
+        f"{args.avatar}, {args.preset}, {config.graph.nodes} nodes; {args.motions[0]} motions to learn from; "
         f"learned methods: {steps[0]} steps of the equilibrium and {steps[1]} of rollouts, {args.seeds} seed(s). "
     )
-    made = [main_table(about, results), swing_table(results)]
-    if any(name in results for name in LEARNED if name != OURS):
-        made.append(paper_table(results))
-    return [*made, long_table(results)]
+    first = results[args.motions[0]]
+    made = [main_table(about, first), swing_table(first)]
+    if any(name in first for name in LEARNED if name != OURS):
+        made.append(paper_table(first))
+    if len(results) > 1:
+        made.append(data_table(results))
+    return [*made, long_table(first)]
 
 
-def main_table(about: str, results: dict[str, list[Found]]) -> Table:
+def data_table(results: dict[int, Results]) -> Table:
+    """What more motions to learn from are worth."""
+    rows = []
+    for count in sorted(results):
+        found = results[count]
+        cells = [across(found[name], "test", "loose") for name in (MEAN, RIDGE, SPACE, POSES, OURS)]
+        unseen = [across(found[name], "unseen", "loose") for name in (RIDGE, OURS)]
+        rows.append([count, *cells, compared(found[OURS], found[RIDGE], "test"), *unseen])
+    return Table(
+        "How much motion it is learned from",
+        "Loose nodes, mm; the same motions of the test throughout, the learned methods trained for the same steps. p: "
+        "ours against ridge regression.",
+        ["motions", MEAN, RIDGE, SPACE, POSES, OURS, "p", f"unseen, {RIDGE}", f"unseen, {OURS}"],
+        rows,
+    )
+
+
+def main_table(about: str, results: Results) -> Table:
     """Errors on all parts, and whether a method differs from ours."""
     rows = []
     for name in ordered(results):
@@ -268,7 +305,7 @@ def main_table(about: str, results: dict[str, list[Found]]) -> Table:
     )
 
 
-def swing_table(results: dict[str, list[Found]]) -> Table:
+def swing_table(results: Results) -> Table:
     """Does it swing as much as it should, and in time?"""
     rows = [
         [n, *(across(results[n], "test", what) for what in ("swing", "lag", "acceleration", "spikes"))]
@@ -285,7 +322,7 @@ def swing_table(results: dict[str, list[Found]]) -> Table:
     )
 
 
-def paper_table(results: dict[str, list[Found]]) -> Table:
+def paper_table(results: Results) -> Table:
     """SMAD Tables 2 and 4: order of the paper's PSNR, and ours of errors."""
     letters = ("A0", "A1", "A2", "A3", "B0", "B1", "B2", "B3")
     printed = {f"{key} ": published.SMAD_2.at(key, "PSNR").value for key in letters}
@@ -312,7 +349,7 @@ def paper_table(results: dict[str, list[Found]]) -> Table:
     )
 
 
-def long_table(results: dict[str, list[Found]]) -> Table:
+def long_table(results: Results) -> Table:
     """SMAD Table 5: errors on long sequences, and whether they grow."""
     rows = []
     for name in ordered(results):
@@ -330,7 +367,7 @@ def long_table(results: dict[str, list[Found]]) -> Table:
     )
 
 
-def ordered(results: dict[str, list[Found]]) -> list[str]:
+def ordered(results: Results) -> list[str]:
     """Twins, yardsticks, then what is learned."""
     first = [name for name in (TWINS, *YARDSTICKS) if name in results]
     return first + [name for name in results if name not in first]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -57,12 +56,18 @@ def of_equilibrium(config: SmadConfig, params: Params, system: System) -> Method
 
 def of_linear(config: SmadConfig, model: Linear, system: System) -> Method:
     """A linear yardstick."""
-    return lambda _, take: np.asarray(_linear(config, model, system, take.poses))
+
+    @jax.jit
+    def roll(model, system, poses):
+        features = dynamics.pose_features(config, system, poses)
+        return dynamics.surfaces(system, poses) + linear.rollout(model, features)
+
+    return lambda _, take: np.asarray(roll(model, system, take.poses))
 
 
 def of_skinning(system: System) -> Method:
     """The driven surface alone."""
-    return lambda _, take: np.asarray(_driven(system, take.poses))
+    return lambda _, take: np.asarray(_surfaces(system, take.poses))
 
 
 def loose(offsets: Float[np.ndarray, "f n 3"]) -> Int[np.ndarray, " m"]:
@@ -180,11 +185,4 @@ def _after(poses):
     return jax.tree.map(lambda x: x[1:], poses)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _linear(config, model, system, poses):
-    return linear.rollout(config, model, system, poses)
-
-
-@jax.jit
-def _driven(system, poses):
-    return jax.lax.map(lambda pose: dynamics.driven(system, pose), poses)
+_surfaces = jax.jit(dynamics.surfaces)

@@ -45,10 +45,14 @@ class Motions:
     "keys" and "run" under the keyboard, LONG frames each (SMAD Table 5: a dynamic and a repetitive sequence).
     """
 
-    train: tuple[Name, ...] = tuple((name, seed) for seed in range(6) for name in ("arcs", "dance", "spins"))
-    test: tuple[Name, ...] = tuple((name, seed) for seed in (6, 7) for name in ("arcs", "dance", "spins"))
+    train: tuple[Name, ...] = tuple((name, seed) for seed in range(24) for name in ("arcs", "dance", "spins"))
+    test: tuple[Name, ...] = tuple((name, seed) for seed in (100, 101) for name in ("arcs", "dance", "spins"))
     unseen: tuple[Name, ...] = tuple((name, seed) for seed in (0, 1) for name in ("kicks", "jumps"))
     long: tuple[Name, ...] = (("keys", 0), ("run", 0))
+
+    def learning(self, count: int) -> Motions:
+        """The same, but to learn from the first so many alone."""
+        return dataclasses.replace(self, train=self.train[:count])
 
 
 class Stage:

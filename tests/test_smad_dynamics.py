@@ -100,31 +100,34 @@ def finished(tmp_path_factory):
             "MOTIONS",
             Motions((("arcs", 0), ("dance", 0)), (("arcs", 1), ("dance", 1)), (("kicks", 0),), (("run", 0),)),
         )
-        args = experiment.Args(methods=("A0 base",), out=tmp_path_factory.mktemp("runs"))
+        args = experiment.Args(methods=("A0 base",), motions=(2, 1), out=tmp_path_factory.mktemp("runs"))
         yield experiment.run(args), args
 
 
 def test_all_methods_and_yardsticks_are_measured(finished):
     folder, _ = finished
-    found = json.loads((folder / "dynamics.json").read_text())
+    both = json.loads((folder / "dynamics.json").read_text())
+    found, less = both["2"], both["1"]
+    assert set(less) == {experiment.TWINS, *experiment.YARDSTICKS, "ours"}
+    assert found["mean drape"][0]["test"]["loose"] != less["mean drape"][0]["test"]["loose"]
     assert set(found) == {experiment.TWINS, *experiment.YARDSTICKS, "ours", "A0 base"}
     errors = {name: np.mean(seeds[0]["test"]["loose"]) for name, seeds in found.items()}
     assert 0 < errors["twins"] < errors["skinning"]
     # Only the tests have twins.
     assert not found["twins"][0]["unseen"]
     page = (folder / "dynamics.md").read_text()
-    for text in ("| mean drape |", "pairs", "run-0", "A0 base", "lag, ms"):
+    for text in ("| mean drape |", "pairs", "run-0", "A0 base", "lag, ms", "How much motion"):
         assert text in page
-    for name in ("nodes.png", "long-run-0.png"):
+    for name in ("motions2/nodes.png", "long-run-0.png"):
         assert (folder / name).stat().st_size > 1000
 
 
 def test_a_second_run_reads_back(finished, capsys):
     folder, args = finished
-    before = (folder / "ours" / "seed0" / "measures.json").stat().st_mtime_ns
+    before = (folder / "motions2" / "ours" / "seed0" / "measures.json").stat().st_mtime_ns
     experiment.run(args)
-    assert (folder / "ours" / "seed0" / "measures.json").stat().st_mtime_ns == before
-    assert "ours, seed 0" not in capsys.readouterr().out
+    assert (folder / "motions2" / "ours" / "seed0" / "measures.json").stat().st_mtime_ns == before
+    assert "ours, 2 motions, seed 0" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -133,6 +136,7 @@ def test_a_second_run_reads_back(finished, capsys):
         ({"avatar": "nobody"}, "unknown avatar 'nobody'.*ghostlady"),
         ({"methods": ("magic",)}, "unknown method 'magic'.*MLP"),
         ({"seeds": 0}, "at least one seed"),
+        ({"motions": (18, 18)}, "different numbers from 1 to"),
     ],
 )
 def test_wrong_arguments_are_named(tmp_path, changes, message):

@@ -180,7 +180,7 @@ def test_a_window_of_poses_may_be_spread_out(system):
     assert config.deformer.pose_span == 9
     params = random_like(dynamics.init(config, system, jax.random.key(0)), 5, 0.1)
     window = jax.random.normal(jax.random.key(6), (9, config.deformer.pose))
-    changed = [dynamics.settled(config, params, window.at[k].add(1.0)) for k in (4, 5)]
-    rest = dynamics.settled(config, params, window)
+    changed = [dynamics.settled(config, params, system, window.at[k].add(1.0)) for k in (4, 5)]
+    rest = dynamics.settled(config, params, system, window)
     assert np.abs(changed[0] - rest).max() > 1e-3
     np.testing.assert_array_equal(changed[1], rest)

@@ -31,20 +31,28 @@ def following(seed):
 
 TAKES = [following(seed) for seed in range(3)]
 UNSEEN = following(9)
-SYSTEM = train_dynamics.fit_scaling(CONFIG, graph.build(POINTS, 4), None, TAKES)
+SYSTEM = train_dynamics.fit_system(CONFIG, graph.build(POINTS, 4), None, TAKES)
 RECORDED = train_dynamics.record(CONFIG, SYSTEM, TAKES)
 
 
+def fit(recorded, **options):
+    return linear.fit(recorded.offsets, recorded.features, recorded.first, **options)
+
+
+def rollout(model):
+    surface = dynamics.surfaces(SYSTEM, UNSEEN.poses)
+    return surface + jax.jit(linear.rollout)(model, dynamics.pose_features(CONFIG, SYSTEM, UNSEEN.poses))
+
+
 def error(**options):
-    model = linear.fit(RECORDED, **options)
-    found = jax.jit(linear.rollout, static_argnums=0)(CONFIG, model, SYSTEM, UNSEEN.poses)
+    found = rollout(fit(RECORDED, **options))
     return float(jnp.sqrt(jnp.mean((found - UNSEEN.positions)[20:] ** 2)))
 
 
 def test_the_mean_drape_is_the_mean_offset():
-    model = linear.fit(RECORDED, components=0)
+    model = fit(RECORDED, components=0)
     np.testing.assert_allclose(model.mean, np.asarray(RECORDED.offsets).mean(0), atol=1e-6)
-    found = linear.rollout(CONFIG, model, SYSTEM, UNSEEN.poses)
+    found = rollout(model)
     np.testing.assert_allclose(found, np.broadcast_to(POINTS + np.asarray(model.mean), found.shape), atol=1e-5)
 
 
@@ -62,10 +70,19 @@ def test_a_state_space_remembers_what_its_window_does_not_span():
 def test_a_take_knows_nothing_of_the_take_before():
     alone = train_dynamics.record(CONFIG, SYSTEM, TAKES[:1])
     twice = train_dynamics.record(CONFIG, SYSTEM, [TAKES[0], TAKES[0]])
-    one, two = (linear.fit(r, components=1, ridge=1e-3) for r in (alone, twice))
+    one, two = (fit(r, components=1, ridge=1e-3) for r in (alone, twice))
     np.testing.assert_allclose(two.weights, one.weights, rtol=1e-3, atol=1e-5)
+
+
+def test_poses_like_none_before_move_little_further_than_any():
+    model = fit(RECORDED, components=1)
+    window = jnp.full((model.window, RECORDED.features.shape[1]), 50.0)
+    far = np.abs(np.tensordot(np.asarray(RECORDED.offsets) - model.mean[None], model.basis[0], 2)).max()
+    np.testing.assert_allclose(model.reach, far, rtol=1e-5)
+    moved = linear.offsets(model, window) - model.mean
+    np.testing.assert_allclose(np.abs(moved), linear.REACH * far * np.abs(model.basis[0]), rtol=1e-5, atol=1e-7)
 
 
 def test_more_components_than_frames_are_refused():
     with pytest.raises(ValueError, match="270"):
-        linear.fit(RECORDED, components=271)
+        fit(RECORDED, components=271)

@@ -50,8 +50,8 @@ class DeformerConfig:
     """
 
     pose: int = 72  # ours: numbers of one body pose, as SMPL's 24 axis-angle joints have
-    pose_window: int = 6  # ours: poses in the window, tau + 1
-    pose_stride: int = 1  # ours: frames from one of them to the next
+    pose_window: int = 8  # ours: poses in the window, tau + 1
+    pose_stride: int = 2  # ours: frames from one of them to the next
     pose_width: int = 256
     pose_embedding: int = 128
     velocities: int = 12  # of each node, newest first: tau_v + 1
@@ -101,18 +101,20 @@ class DynamicsConfig:
     """How the dynamics are learned from tracks; from those of videos the equilibrium alone, and the rest from pictures
     (`PicturesConfig`). All is ours.
 
-    target_stage: of what poses alone say of the offsets, which needs no rollouts, in frames; stage: of all, in rollouts
-    of so many `frames`, which starts from there. noise: of the offsets from which rollouts start, in units of the
-    offsets' spread, constant over the history. target: weight of the error of what poses alone say. isometry, damping:
-    weights of Eq. 11, means over edges and nodes.
+    components: of the offsets, whose ridge regression from the pose window (with so much `ridge`) is the drape that the
+    equilibrium departs from; 0: none.
+    target_stage: of what poses alone say of the offsets, which needs no rollouts, in frames; stage: of all else, in
+    rollouts of so many `frames`. noise: of the offsets from which rollouts start, in units of the
+    offsets' spread, constant over the history. isometry, damping: weights of Eq. 11, means over edges and nodes.
 
     The paper's weights, 0.1 and 0.01, are for sums in its own units: in units of the offsets' spread they take true
     folds for stretch (docs/smad.md).
     """
 
+    components: int = 48
+    ridge: float = 0.02
     frames: int = 12
     noise: float = 0.05
-    target: float = 0.5
     isometry: float = 0.001
     damping: float = 0.0001
     target_stage: StageConfig = StageConfig(6_000, 64, 1e-3)

@@ -28,10 +28,11 @@ from jaxtyping import Array, Float, Key
 from avatarjax.nets.functional import Params
 from avatarjax.physics import mass_spring_damper as msd
 from avatarjax.physics.mass_spring_damper import Springs
-from avatarjax.smad import deformer, driving, skeletal
+from avatarjax.smad import deformer, driving, linear, skeletal
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.graph import Graph
+from avatarjax.smad.linear import Linear
 from avatarjax.smad.skeletal import Skin
 
 # Numbers of a node beside its place and velocities: at rest, offset, swing, the surface's motion.
@@ -59,7 +60,8 @@ class Scaling:
 @typing.no_type_check
 @flax.struct.dataclass
 class System:
-    """What dynamics are learned for: the graph, what drives its nodes, and scaling.
+    """What dynamics are learned for: the graph, what drives its nodes, scaling, and the drape that a window of poses
+    says linearly, from which the learned equilibrium departs (none: from no offset).
 
     Without a skin (its joints are not known) the nodes' places at rest are the driven surface.
     """
@@ -67,6 +69,7 @@ class System:
     graph: Graph
     skin: Skin | None
     scaling: Scaling
+    drape: Linear | None = None
 
 
 @typing.no_type_check
@@ -91,7 +94,7 @@ def sized(config: SmadConfig, joints: int) -> SmadConfig:
 
 
 def init(config: SmadConfig, system: System, key: Key[Array, ""]) -> Params:
-    """Fresh parameters: a stiff, well damped system without inertia, an equilibrium of no offset, a network that adds
+    """Fresh parameters: a stiff, well damped system without inertia, the drape as equilibrium, a network that adds
     nothing."""
     nodes, embedding = len(system.graph.positions), config.deformer.pose_embedding
     return {
@@ -126,12 +129,24 @@ def driven(system: System, pose: Pose) -> Float[Array, "n 3"]:
     return system.graph.positions if system.skin is None else skeletal.pose_points(system.skin, pose)
 
 
-def settled(config: SmadConfig, params: Params, window: Float[Array, "w p"]) -> Float[Array, "n 3"]:
-    """The offset that a window of poses alone determines: a linear reading of the network's own embedding of it."""
+def surfaces(system: System, poses: Pose) -> Float[Array, "t n 3"]:
+    """The driven surface under every one of t poses, in the body frame of each."""
+    return jax.lax.map(lambda pose: driven(system, pose), poses)
+
+
+def pose_features(config: SmadConfig, system: System, poses: Pose) -> Float[Array, "t p"]:
+    """Normalised features of every one of t poses; before the first the body is taken to have stood still."""
+    return (driving.track(poses, config.dt) - system.scaling.pose_mean[None]) / system.scaling.pose_scale[None]
+
+
+def settled(config: SmadConfig, params: Params, system: System, window: Float[Array, "w p"]) -> Float[Array, "n 3"]:
+    """The offset that a window of poses alone determines: the drape, and a linear reading of the network's own
+    embedding of the window."""
     if not config.equilibrium:
         return jnp.zeros(params["target"].shape[1:])
-    embedding = deformer.embed(config.deformer, params["deformer"], window[:: config.deformer.pose_stride])
-    return jnp.tensordot(embedding, params["target"], 1)
+    window = window[:: config.deformer.pose_stride]
+    learned = jnp.tensordot(deformer.embed(config.deformer, params["deformer"], window), params["target"], 1)
+    return learned if system.drape is None else learned + linear.offsets(system.drape, window)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -140,12 +155,12 @@ def without_swing(
 ) -> tuple[Float[Array, "t n 3"], Float[Array, "t n 3"]]:
     """The driven surface under every one of t poses, and the nodes at the equilibrium that poses alone determine, both
     in the body frames; before the first pose the body is taken to have stood still."""
-    surface = jax.lax.map(lambda pose: driven(system, pose), poses)
-    features = (driving.track(poses, config.dt) - system.scaling.pose_mean[None]) / system.scaling.pose_scale[None]
+    surface = surfaces(system, poses)
+    features = pose_features(config, system, poses)
 
     def at(frame):
         back = jnp.maximum(frame - jnp.arange(config.deformer.pose_span), 0)
-        return settled(config, params, features[back])
+        return settled(config, params, system, features[back])
 
     return surface, surface + jax.lax.map(at, jnp.arange(len(surface)))
 
@@ -156,7 +171,7 @@ def reset(config: SmadConfig, params: Params, system: System, pose: Pose) -> Sta
     features = _normalised(system, driving.features(pose, pose, config.dt))
     window = jnp.repeat(features[None], config.deformer.pose_span, axis=0)
     still = jnp.zeros((len(surface), max(config.deformer.velocities, 1), 3))
-    offset = settled(config, params, window)
+    offset = settled(config, params, system, window)
     return State(offset, still, jnp.stack([offset, offset]), jnp.stack([surface, surface]), window, pose)
 
 
@@ -173,7 +188,7 @@ def step(config: SmadConfig, params: Params, system: System, state: State, pose:
     # How the surface accelerates in the world, seen in the body frame: a second difference, which is late by a frame.
     lurch = _turned(pose, world - 2 * state.driven[0] + state.driven[1]) / config.dt**2
     sweep = _turned(pose, world - state.driven[0]) / config.dt
-    equilibrium = jnp.concatenate([settled(config, params, window)[None], state.equilibrium])
+    equilibrium = jnp.concatenate([settled(config, params, system, window)[None], state.equilibrium])
     swing = state.offset - equilibrium[1]
     inputs = [system.graph.positions, state.offset / scaling.offset, swing / scaling.offset]
     inputs += [sweep, lurch / scaling.drive]

@@ -17,9 +17,10 @@ from avatarjax.smad.config import PRESETS, SmadConfig
 from avatarjax.smad.dynamics import Scaling, System
 from avatarjax.smad.embedded import Binding
 from avatarjax.smad.graph import Graph
+from avatarjax.smad.linear import Linear
 from avatarjax.smad.skeletal import Skin
 
-VERSION = 1
+VERSION = 2
 FILE = "avatar.safetensors"
 
 
@@ -65,10 +66,13 @@ def _read(path: Path) -> Avatar:
         if metadata["skeleton"] is not None:
             names, parents = (tuple(metadata["skeleton"][part]) for part in ("names", "parents"))
             skin = Skin(Rig(**system["skin"]["rig"], names=names, parents=parents), system["skin"]["basis"])
+        drape, net = system.get("drape"), config.deformer
+        if drape is not None:
+            drape = Linear(**drape, window=net.pose_window, stride=net.pose_stride, lags=0)
         return Avatar(
             gaussians=Gaussians(**tree["gaussians"]),
             binding=Binding(**tree["binding"]),
-            system=System(Graph(**system["graph"]), skin, Scaling(**system["scaling"])),
+            system=System(Graph(**system["graph"]), skin, Scaling(**system["scaling"]), drape),
             params=tree["params"],
             config=config,
         )

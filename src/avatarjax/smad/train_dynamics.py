@@ -7,7 +7,7 @@ learns to live with its own errors. Tracks come from the refined initialisation 
 from __future__ import annotations
 
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import flax.struct
 import jax
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from avatarjax.nets.functional import Params
-from avatarjax.smad import driving, dynamics
+from avatarjax.smad import driving, dynamics, linear
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.deformer import Deltas
 from avatarjax.smad.driving import Pose
@@ -50,9 +50,9 @@ class Recorded:
     first: Int[Array, "f"]
 
 
-def fit_scaling(config: SmadConfig, graph: Graph, skin: Skin | None, takes: Sequence[Take]) -> System:
-    """The system with statistics of these takes, to be learned for. Raises ValueError without takes, for one of less
-    than three frames, and where positions are not one for each node."""
+def fit_system(config: SmadConfig, graph: Graph, skin: Skin | None, takes: Sequence[Take]) -> System:
+    """The system to be learned for, with the statistics and the drape of these takes, in closed form. Raises ValueError
+    without takes, for one of less than three frames, and where positions are not one for each node."""
     if not takes:
         raise ValueError("no takes to learn dynamics from: give at least one")
     for take in takes:
@@ -66,37 +66,44 @@ def fit_scaling(config: SmadConfig, graph: Graph, skin: Skin | None, takes: Sequ
     deviation = features.std(axis=0)
     # A joint that hardly moves in training must not shout where it moves more.
     scaling = Scaling(jnp.asarray(features.mean(axis=0)), jnp.asarray(np.maximum(deviation, 0.05)), one, one, one, one)
-    system = System(graph, skin, scaling)
-    offsets, moved, lurched, drives = [], [], [], []
-    for take in takes:
-        surface = _surfaces(system, take.poses)
-        offset = np.asarray(take.positions) - np.asarray(driving.to_body(take.poses, surface))
-        offsets.append(offset)
-        moved.append(np.diff(offset, axis=0) / config.dt)
-        lurched.append(np.diff(offset, n=2, axis=0) / config.dt**2)
-        drives.append(np.diff(np.asarray(surface), n=2, axis=0) / config.dt**2)
+    recorded = [record(config, System(graph, skin, scaling), [take]) for take in takes]
 
-    def spread(values):
-        return jnp.asarray(max(1e-4, float(np.sqrt(np.mean(np.concatenate(values) ** 2)))), jnp.float32)
+    def spread(values, order):
+        changes = [np.diff(np.asarray(x), n=order, axis=0) / config.dt**order for x in values]
+        return jnp.asarray(max(1e-4, float(np.sqrt(np.mean(np.concatenate(changes) ** 2)))), jnp.float32)
 
+    offsets = [part.offsets for part in recorded]
     scaling = scaling.replace(
-        offset=spread(offsets), velocity=spread(moved), acceleration=spread(lurched), drive=spread(drives)
+        offset=spread(offsets, 0),
+        velocity=spread(offsets, 1),
+        acceleration=spread(offsets, 2),
+        drive=spread([part.driven for part in recorded], 2),
     )
-    return system.replace(scaling=scaling)
+    system, settings = System(graph, skin, scaling), config.dynamics
+    if not (config.equilibrium and settings.components):
+        return system
+    whole = record(config, system, takes)
+    drape = linear.fit(
+        *(whole.offsets, whole.features, whole.first),
+        components=min(settings.components, len(whole.first)),
+        window=config.deformer.pose_window,
+        stride=config.deformer.pose_stride,
+        ridge=settings.ridge,
+    )
+    return system.replace(drape=drape)
 
 
 def record(config: SmadConfig, system: System, takes: Sequence[Take]) -> Recorded:
     """The takes, ready to start rollouts from."""
     parts, start = [], 0
     for take in takes:
-        surface = _surfaces(system, take.poses)
-        features = driving.track(take.poses, config.dt) - system.scaling.pose_mean[None]
+        surface = dynamics.surfaces(system, take.poses)
         parts.append(
             Recorded(
                 poses=take.poses,
-                offsets=take.positions - driving.to_body(take.poses, surface),
-                driven=surface,
-                features=features / system.scaling.pose_scale[None],
+                offsets=take.positions - surface,
+                driven=driving.to_world(take.poses, surface),
+                features=dynamics.pose_features(config, system, take.poses),
                 first=jnp.full(len(take.positions), start, jnp.int32),
             )
         )
@@ -104,19 +111,19 @@ def record(config: SmadConfig, system: System, takes: Sequence[Take]) -> Recorde
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
-def state_at(config: SmadConfig, params: Params, recorded: Recorded, frame: Int[Array, ""]) -> State:
+def state_at(config: SmadConfig, params: Params, system: System, recorded: Recorded, frame: Int[Array, ""]) -> State:
     """The state that the recording was in; before a take began, it is taken to have stood still."""
     back = _back(config, recorded, frame)
-    equilibrium = jax.vmap(lambda window: dynamics.settled(config, params, window))(
-        _windows(config, recorded, back[:2])
-    )
+    equilibrium = _settled(config, params, system, recorded, back[:2])
     return _state(config, recorded, back, recorded.offsets[back], equilibrium)
 
 
-def calm_at(config: SmadConfig, params: Params, recorded: Recorded, frame: Int[Array, ""]) -> State:
+def calm_at(config: SmadConfig, params: Params, system: System, recorded: Recorded, frame: Int[Array, ""]) -> State:
     """The state of a frame as if the offsets had always been at their equilibrium, whatever was recorded."""
     back = _back(config, recorded, frame)
-    offsets = jax.vmap(lambda window: dynamics.settled(config, params, window))(_windows(config, recorded, back))
+    offsets = jax.vmap(lambda window: dynamics.settled(config, params, system, window))(
+        _windows(config, recorded, back)
+    )
     return _state(config, recorded, back, offsets, offsets[:2])
 
 
@@ -136,6 +143,14 @@ def _windows(config: SmadConfig, recorded: Recorded, frames: Int[Array, "k"]) ->
     return recorded.features[jnp.maximum(back, jnp.asarray(recorded.first)[frames][:, None])]
 
 
+def _settled(
+    config: SmadConfig, params: Params, system: System, recorded: Recorded, frames: Int[Array, "k"]
+) -> Float[Array, "k n 3"]:
+    """The equilibrium in each frame."""
+    windows = _windows(config, recorded, frames)
+    return jax.vmap(lambda window: dynamics.settled(config, params, system, window))(windows)
+
+
 def _state(config: SmadConfig, recorded: Recorded, back: Int[Array, "k"], offsets, equilibrium) -> State:
     return State(
         offset=offsets[0],
@@ -148,9 +163,9 @@ def _state(config: SmadConfig, recorded: Recorded, back: Int[Array, "k"], offset
 
 
 def losses(system: System, offsets: Float[Array, "t n 3"], states: State) -> dict[str, Float[Array, ""]]:
-    """Terms of the loss of a rollout of t frames against recorded offsets: `data` and `target`, mean squared errors in
-    units of the offsets' spread; `isometry`, mean squared stretch of edges, and `damping`, mean squared velocity of
-    offsets (Eq. 11 as means), both in the same unit."""
+    """Terms of the loss of a rollout of t frames against recorded offsets: `data`, mean squared errors in units of the
+    offsets' spread; `isometry`, mean squared stretch of edges, and `damping`, mean squared velocity of offsets (Eq. 11
+    as means), both in the same unit."""
     unit = system.scaling.offset
     i, j = system.graph.edges.T
     rest = jnp.linalg.norm(system.graph.positions[i] - system.graph.positions[j], axis=-1)
@@ -161,7 +176,6 @@ def losses(system: System, offsets: Float[Array, "t n 3"], states: State) -> dic
 
     return {
         "data": jnp.mean((states.offset - offsets) ** 2) / unit**2,
-        "target": jnp.mean((states.equilibrium[:, 0] - offsets) ** 2) / unit**2,
         "isometry": jnp.mean(jax.vmap(stretch)(states)) / unit**2,
         "damping": jnp.mean(states.velocities[:, :, 0] ** 2) / system.scaling.velocity**2,
     }
@@ -169,7 +183,7 @@ def losses(system: System, offsets: Float[Array, "t n 3"], states: State) -> dic
 
 def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -> Params:
     """Parameters of the dynamics, learned from takes (SMAD Eq. 9 with the tracks' error for the picture's): first the
-    target alone, from single frames, then all, through rollouts."""
+    equilibrium, from single frames, then all else, through rollouts."""
     recorded = record(config, system, takes)
     initial = train_target(config, system, recorded, run)
     settings = config.dynamics
@@ -183,13 +197,24 @@ def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -
         system, recorded = batch["system"], batch["recorded"]
 
         def one(start, key):
-            state = shaken(config, system, state_at(config, params, recorded, start), key)
+            state = shaken(config, system, state_at(config, params, system, recorded, start), key)
             states, _ = roll(config, params, system, recorded, state, start, frames)
             return losses(system, recorded.offsets[start + 1 + jnp.arange(frames)], states)
 
         return total(config, jax.vmap(one)(batch["start"], jax.random.split(key, len(batch["start"]))))
 
-    return train_stage(run, "dynamics", settings.stage, config, loss, initial, batch_at)
+    return train_stage(run, "dynamics", settings.stage, config, loss, initial, batch_at, hold_equilibrium(config))
+
+
+def hold_equilibrium(config: SmadConfig) -> Callable[[Params, Params, typing.Any], Params] | None:
+    """What keeps the equilibrium as it was learned from single frames, of which there are more than of rollouts: for
+    `train_stage`. None without an equilibrium."""
+
+    def hold(new, old, batch):
+        network = new["deformer"]["network"] | {"pose": old["deformer"]["network"]["pose"]}
+        return new | {"target": old["target"], "deformer": new["deformer"] | {"network": network}}
+
+    return hold if config.equilibrium else None
 
 
 def rollouts(recorded: Recorded, frames: int) -> tuple[Int[np.ndarray, " s"], int]:
@@ -231,7 +256,7 @@ def shaken(config: SmadConfig, system: System, state: State, key: Key[Array, ""]
 def total(config: SmadConfig, found: dict[str, Float[Array, "..."]]) -> tuple[Array, Metrics]:
     """The sum of the means of `losses`, each with its weight, and the means."""
     settings, means = config.dynamics, {name: jnp.mean(values) for name, values in found.items()}
-    weights = {"data": 1.0, "target": settings.target, "isometry": settings.isometry, "damping": settings.damping}
+    weights = {"data": 1.0, "isometry": settings.isometry, "damping": settings.damping}
     return jnp.sum(jnp.stack([weights[name] * value for name, value in means.items()])), means
 
 
@@ -249,7 +274,7 @@ def train_target(config: SmadConfig, system: System, recorded: Recorded, run: Ru
         def missed(frame):
             recorded = batch["recorded"]
             window = window_at(config, recorded, frame)
-            return jnp.mean((dynamics.settled(config, params, window) - recorded.offsets[frame]) ** 2)
+            return jnp.mean((dynamics.settled(config, params, system, window) - recorded.offsets[frame]) ** 2)
 
         return jnp.mean(jax.vmap(missed)(batch["frames"])) / batch["system"].scaling.offset ** 2, {}
 
@@ -259,11 +284,6 @@ def train_target(config: SmadConfig, system: System, recorded: Recorded, run: Ru
 def replay(config: SmadConfig, params: Params, system: System, take: Take, start: int) -> Float[Array, "t n 3"]:
     """A rollout over the rest of a take from the state that it was in at a frame: positions (t, n, 3) in the body
     frames of the frames after it."""
-    state = state_at(config, params, record(config, system, [take]), jnp.asarray(start))
+    state = state_at(config, params, system, record(config, system, [take]), jnp.asarray(start))
     poses = jax.tree.map(lambda x: x[start + 1 :], take.poses)
     return dynamics.rollout(config, params, system, state, poses)[1]
-
-
-def _surfaces(system: System, poses: Pose) -> Float[Array, "t n 3"]:
-    """The driven surface in the world in every pose."""
-    return jax.lax.map(lambda pose: driving.to_world(pose, dynamics.driven(system, pose)), poses)

@@ -50,7 +50,7 @@ def train_drape(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
 
         def one(frame):
             window = train_dynamics.window_at(config, recorded, frame)
-            offset = dynamics.settled(config, params["dynamics"], window)
+            offset = dynamics.settled(config, params["dynamics"], fixed.system, window)
             pose = jax.tree.map(lambda x: x[frame], recorded.poses)
             nodes = dynamics.driven(fixed.system, pose) + offset
             cloud = embedded.carry(fixed.binding, gaussians, fixed.system.graph, nodes)
@@ -85,7 +85,7 @@ def train_swing(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
         fixed = batch["avatar"]
 
         def one(start):
-            state = train_dynamics.calm_at(config, params, batch["recorded"], start)
+            state = train_dynamics.calm_at(config, params, fixed.system, batch["recorded"], start)
             states, looks = train_dynamics.roll(config, params, fixed.system, batch["recorded"], state, start, frames)
             states, looks = jax.tree.map(lambda x: x[drawn], (states, looks))
             nodes = jax.vmap(lambda state: dynamics.positions(fixed.system, state))(states)
@@ -94,7 +94,8 @@ def train_swing(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
         clouds, nodes, offsets = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(one)(batch["start"]))
         return _total(avatar, key, batch, splat, clouds, nodes, offsets)
 
-    params = train_stage(run, "swing", settings.swing_stage, config, loss, avatar.params, batch_at)
+    hold = train_dynamics.hold_equilibrium(config)
+    params = train_stage(run, "swing", settings.swing_stage, config, loss, avatar.params, batch_at, hold)
     return avatar.replace(params=params)
 
 
@@ -145,14 +146,9 @@ def _recorded(avatar: Avatar, takes: Footage) -> Recorded:
     parts, first = [], 0
     for count in takes.takes:
         poses = jax.tree.map(lambda x, k=slice(first, first + count): x[k], takes.poses)
-        parts.append(Take(poses, _driven(avatar.system, poses)))
+        parts.append(Take(poses, dynamics.surfaces(avatar.system, poses)))
         first += count
     return train_dynamics.record(avatar.config, avatar.system, parts)
-
-
-@jax.jit
-def _driven(system, poses):
-    return jax.lax.map(lambda pose: dynamics.driven(system, pose), poses)
 
 
 def _fixed(avatar: Avatar, recorded: Recorded) -> dict[str, typing.Any]:
