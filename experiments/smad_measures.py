@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import functools
+import itertools
+import time
 import typing
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
 from avatarjax import smad
 from avatarjax.cameras import Camera
 from avatarjax.data import MonocularVideo, capture
+from avatarjax.data.mesh_renderer import MeshRenderer
 from avatarjax.gaussians import Gaussians
 from avatarjax.io import weights
 from avatarjax.metrics import image, lpips
@@ -27,6 +31,7 @@ from avatarjax.splat import SplatConfig, render, required_capacity
 
 EVERY = 5  # one frame of so many is drawn and measured
 SETTLE = 15  # frames after the start that no measure counts: the recording does not begin at rest
+NOVEL = (np.pi / 2, np.pi)  # azimuths of cameras that did not film, which stood at 0
 LOOSE = 0.3  # the share of nodes that are furthest from skinning in training
 
 
@@ -50,22 +55,76 @@ def move(avatar: smad.Avatar, poses: Pose) -> dict[str, Moved]:
     return found
 
 
+def frames_a_second(avatar: smad.Avatar, poses: Pose) -> float:
+    """Of a rollout with all Gaussians, not drawn: the median of three, after one that compiles."""
+    times = []
+    for _ in range(4):
+        began = time.perf_counter()
+        jax.block_until_ready(_rollout(avatar, smad.reset(avatar, jax.tree.map(lambda x: x[0], poses)), poses))
+        times.append(time.perf_counter() - began)
+    return len(poses.root_translation) / float(np.median(times[1:]))
+
+
 def follow(avatar: smad.Avatar, take: Take) -> Moved:
     """The avatar on the nodes of a track."""
     after = jax.tree.map(lambda x: x[1:], take)
     return Moved(functools.partial(_dressed, avatar, after.positions, after.poses), np.asarray(after.positions))
 
 
+class View(typing.NamedTuple):
+    """What a camera sees of a take of so many frames: of each a camera, the picture (h, w, 3) in 0..1 with what is not
+    the person black, and the mask."""
+
+    frames: int
+    at: typing.Callable[[int], tuple[Camera, jax.Array, Bool[np.ndarray, "h w"]]]
+
+
+def recorded_view(take: MonocularVideo) -> View:
+    """What the camera that filmed saw."""
+
+    def at(frame):
+        inside = take.masks[frame]
+        return take.camera_at(frame), over_black(take.images()[frame], inside), inside
+
+    return View(len(take), at)
+
+
+def novel_views(take: MonocularVideo, texture: UInt8[np.ndarray, "h w 3"]) -> list[View]:
+    """What cameras would have seen that did not film: from the left of the figure and from behind, where it faces the
+    one that did. None of takes whose meshes are not known."""
+    path = Path(take.folder) / capture.MESHES
+    if not path.is_file():
+        return []
+    tree = weights.load_arrays(path)[0]
+    roots = np.asarray(take.poses.root_translation)
+    renderer = MeshRenderer(tree["faces"], tree["uvs"], texture)
+
+    def seen(azimuth):
+        cameras = capture.following_camera(roots, take.masks.shape[1], azimuth)
+
+        def at(frame):
+            camera = jax.tree.map(lambda x: x[frame], cameras)
+            vertices = tree["vertices"][frame].astype(np.float32) + roots[frame]
+            picture, inside = capture.photograph(renderer, vertices, camera)
+            return camera, over_black(picture, inside), inside
+
+        return View(len(take), at)
+
+    return [seen(azimuth) for azimuth in NOVEL]
+
+
 def picture_errors(
-    take: MonocularVideo, moved: dict[str, Moved], perceptual: lpips.Network | None
+    views: Sequence[View], moved: dict[str, Moved], perceptual: lpips.Network | None
 ) -> dict[str, dict[str, Estimate]]:
-    """PSNR of the whole picture over black and inside the mask, SSIM and LPIPS of each method, over measured frames."""
+    """PSNR of the whole picture over black and inside the mask, SSIM and LPIPS of each method, over measured frames of
+    all views; those of one frame count together."""
     values: dict[str, dict[str, list[float]]] = {name: {} for name in moved}
-    for frame in range(SETTLE, len(take), EVERY):
-        truth, inside = over_black(take, frame)
+    frames = range(SETTLE, views[0].frames, EVERY)
+    for view, frame in itertools.product(views, frames):
+        camera, truth, inside = view.at(frame)
+        mask = jnp.asarray(inside[..., None], jnp.float32)
         for name, method in moved.items():
-            drawn = jnp.clip(draw(method.gaussians(frame), take.camera_at(frame)), 0, 1)
-            mask = jnp.asarray(inside[..., None], jnp.float32)
+            drawn = jnp.clip(draw(method.gaussians(frame), camera), 0, 1)
             found = {
                 "PSNR": image.psnr(drawn, truth),
                 "PSNR in the mask": image.masked_psnr(drawn, truth, mask),
@@ -75,13 +134,13 @@ def picture_errors(
                 found["LPIPS"] = lpips.distance(perceptual, drawn, truth)
             for what, value in found.items():
                 values[name].setdefault(what, []).append(float(value))
-    return {name: {what: bootstrap(found) for what, found in kinds.items()} for name, kinds in values.items()}
+    groups = np.tile(np.asarray(frames), len(views))
+    return {name: {what: bootstrap(found, groups) for what, found in kinds.items()} for name, kinds in values.items()}
 
 
-def over_black(take: MonocularVideo, frame: int) -> tuple[jax.Array, Bool[np.ndarray, "h w"]]:
-    """A recorded picture (h, w, 3) in 0..1 with what is not the person black, and the mask."""
-    inside = take.masks[frame]
-    return jnp.asarray(take.images()[frame] / 255 * inside[..., None], jnp.float32), inside
+def over_black(picture: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"]) -> jax.Array:
+    """A picture (h, w, 3) in 0..1 with what is not inside the mask black."""
+    return jnp.asarray(picture / 255 * inside[..., None], jnp.float32)
 
 
 def draw(gaussians: Gaussians, camera: Camera) -> jax.Array:

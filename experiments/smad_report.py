@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from avatarjax import smad
-from avatarjax.data import MonocularVideo
+from avatarjax.data import MonocularVideo, avatars
 from avatarjax.io import atomic, exr, video
 from avatarjax.metrics import lpips, pretrained
 from avatarjax.metrics.report import Report
@@ -49,6 +49,7 @@ def write(
         regions["loose nodes"] = measures.loose_nodes(
             avatar, known, [driving.recorded(take.poses) for take in shown["train"]]
         )
+    texture = None if experiment.args.videos else np.asarray(avatars.build(experiment.args.avatar).texture)
     results: dict[str, typing.Any] = {}
     fits = dict(zip([take.folder for take in takes["train"]], tracks, strict=True))
     for part, found in shown.items():
@@ -57,25 +58,27 @@ def write(
             if take.folder in fits:
                 moved["tracks"] = measures.follow(avatar, fits[take.folder])
             name = f"{part} {take.folder.name}"
-            results[name] = {"pictures": measures.picture_errors(take, moved, perceptual)}
+            recorded = measures.recorded_view(take)
+            results[name] = {"pictures": measures.picture_errors([recorded], moved, perceptual)}
+            if novel := measures.novel_views(take, texture) if texture is not None else []:
+                results[name]["novel views"] = measures.picture_errors(novel, moved, perceptual)
             if truth is not None:
                 results[name]["nodes"] = {r: measures.node_errors(truth, moved, c) for r, c in regions.items()}
             if take is found[0] and part != "train":
-                film(folder, part, take, moved)
-    atomic.write_text(
-        folder / "metrics.json", json.dumps(plain(results) | {"seconds": experiment.clock.seconds}, indent=1)
-    )
+                film(folder, part, recorded, moved)
+    speed = measures.frames_a_second(avatar, driving.recorded(canonical.poses))
+    known = plain(results) | {"seconds": experiment.clock.seconds, "frames a second": speed}
+    atomic.write_text(folder / "metrics.json", json.dumps(known, indent=1))
     page(experiment, avatar, results, shown)
 
 
-def film(folder, part: str, take: MonocularVideo, moved: dict[str, measures.Moved]) -> None:
+def film(folder, part: str, view: measures.View, moved: dict[str, measures.Moved]) -> None:
     """A video and a contact sheet: the recording, ours, skinning, and how far ours is from the recording."""
     rows = []
-    for frame in range(1, len(take)):
-        truth, _ = measures.over_black(take, frame)
+    for frame in range(1, view.frames):
+        camera, truth, _ = view.at(frame)
         ours, skinned = (
-            jnp.clip(measures.draw(moved[name].gaussians(frame), take.camera_at(frame)), 0, 1)
-            for name in ("ours", "skinning")
+            jnp.clip(measures.draw(moved[name].gaussians(frame), camera), 0, 1) for name in ("ours", "skinning")
         )
         error = jnp.abs(ours - truth).mean(-1, keepdims=True).repeat(3, -1)
         panel = jnp.concatenate([truth, ours, skinned, jnp.clip(3 * error, 0, 1)], axis=1)
@@ -104,13 +107,13 @@ def page(experiment: Experiment, avatar: smad.Avatar, results, shown) -> None:
             report.media(folder / f"{part}.mp4", caption)
             report.media(folder / f"{part}.png", caption)
     report.heading("Pictures")
-    kinds = list(next(iter(results.values()))["pictures"]["ours"])
-    rows = [[n, m, *(f["pictures"][m][k] for k in kinds)] for n, f in results.items() for m in f["pictures"]]
-    report.table(
-        f"One frame of {measures.EVERY}, over black, from the camera that filmed; intervals over frames",
-        ["take", "method", *kinds],
-        rows,
-    )
+    for views, where in (("pictures", "the camera that filmed"), ("novel views", "cameras beside and behind it")):
+        measured = {name: found[views] for name, found in results.items() if views in found}
+        if measured:
+            kinds = list(next(iter(measured.values()))["ours"])
+            rows = [[n, m, *(found[m][k] for k in kinds)] for n, found in measured.items() for m in found]
+            caption = f"One frame of {measures.EVERY}, over black, from {where}; intervals over frames"
+            report.table(caption, ["take", "method", *kinds], rows)
     if any("nodes" in found for found in results.values()):
         report.heading("Geometry")
         report.text(

@@ -16,6 +16,7 @@ from avatarjax.smad.config import DynamicsConfig, FilmConfig, PicturesConfig
 from avatarjax.smad.graph import GraphConfig
 from avatarjax.train import StageConfig
 from experiments import smad as experiment
+from experiments.tables import __main__ as tables
 
 CI = configs.preset("ci")
 FRAMES = 26
@@ -56,7 +57,10 @@ def test_everything_that_is_promised_is_written(finished):
     for text in ("How it moves", "skinning", "loose nodes", "PSNR in the mask", "Environment", "natural frequencies"):
         assert text in page
     found = json.loads((finished / "metrics.json").read_text())
-    assert set(found) == {"train arcs-0", "test arcs-1", "seconds"}
+    assert set(found) == {"train arcs-0", "test arcs-1", "seconds", "frames a second"}
+    assert found["frames a second"] > 1
+    for views in ("pictures", "novel views"):
+        assert all(0 < kinds["PSNR"]["mean"] < 50 for kinds in found["test arcs-1"][views].values())
     errors = found["test arcs-1"]["nodes"]["all nodes"]
     assert set(errors) == {"ours", "pose window alone", "skinning"}
     assert all(0 < error["mean"] < 500 for error in errors.values())
@@ -72,6 +76,17 @@ def test_the_trained_avatar_loads_and_rolls_out(finished):
     drawn = np.asarray(picture.alpha) > 0.5
     both, either = (drawn & take.masks[-1]).sum(), (drawn | take.masks[-1]).sum()
     assert both > 0.4 * either
+
+
+def test_a_table_is_made_of_it(finished):
+    args = tables.Args(("monocular",), preset="ci", avatars=("ghostlady",), out=finished.parents[2])
+    (table,) = tables.run_tables(args)
+    found = json.loads((finished / "metrics.json").read_text())["test arcs-1"]
+    (row,) = [row for row in table.rows if row[:3] == ["ghostlady", "another seed", "ours"]]
+    assert row[3].mean == found["pictures"]["ours"]["PSNR"]["mean"]
+    assert row[6].mean == found["novel views"]["ours"]["PSNR"]["mean"]
+    assert row[-1].mean == found["nodes"]["loose nodes"]["ours"]["mean"]
+    assert any("reproduced" in remark for remark in table.remarks)
 
 
 def test_a_second_run_reuses_and_a_stage_runs_anew(finished, capsys):

@@ -1,4 +1,4 @@
-"""Print UNICA's tables and figures as measured on finished runs, beside the paper's numbers.
+"""Print the papers' tables and figures as measured on finished runs, beside the papers' numbers.
 
     python -m experiments.tables summary                       # what the reports of all trained avatars say
     python -m experiments.tables quality                       # Tables 2 and C: all trained avatars
@@ -10,10 +10,12 @@
     python -m experiments.tables times                         # Table D
     python -m experiments.tables sliding                       # Fig. 6: 2,000 frames, minutes an avatar
     python -m experiments.tables components novelty trail strips   # Figs. B, C (f), 5, I to L
+    python -m experiments.tables monocular --preset ci         # SMAD's Tables 1, 3 and I
 
-Runs are those of `python -m experiments.unica --avatar NAME --train` under OUT/unica/NAME/PRESET. Results go to
+Runs are those of `python -m experiments.unica --avatar NAME --train` under OUT/unica/NAME/PRESET, and for `monocular`
+those of `python -m experiments.smad --avatar NAME` under OUT/smad/NAME/PRESET. Results go to
 OUT/tables/PRESET/: NAME.md with its pictures, and what was measured in cells.json, so that an interrupted table goes
-on. SV4D and the user study of the paper are not reproduced.
+on. SV4D and the user study of UNICA are not reproduced; SMAD's Tables 2 and 4 to K: experiments.smad_dynamics.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from avatarjax.io import atomic
 from avatarjax.metrics import environment
 from avatarjax.unica.config import DynamicsName, PresetName
 from experiments import command_line
-from experiments.tables import context, feed_forward, figures, images, long, quality, resolution, summary
+from experiments.tables import context, feed_forward, figures, images, long, monocular, quality, resolution, summary
 from experiments.tables.finished import Finished
 from experiments.tables.table import Notebook, Table
 
@@ -48,6 +50,7 @@ Name = typing.Literal[
     "novelty",
     "trail",
     "strips",
+    "monocular",
 ]
 
 
@@ -71,7 +74,9 @@ class Args:
 
 def run_tables(args: Args) -> list[Table]:
     """Measure, print and write the tables. Raises ValueError where there is no finished run."""
-    runs = finished(args)
+    videos = folders(args, "smad", "--avatar {}") if "monocular" in args.names else []
+    others = set(args.names) - {"monocular"}
+    runs = [Finished(f) for f in folders(args, "unica", "--avatar {} --train")] if others else []
     folder = args.out / "tables" / args.preset
     folder.mkdir(parents=True, exist_ok=True)
     notebook = Notebook(folder / "cells.json")
@@ -89,6 +94,7 @@ def run_tables(args: Args) -> list[Table]:
         "novelty": lambda: figures.novelty(runs, folder),
         "trail": lambda: figures.trail(runs, folder),
         "strips": lambda: figures.strips(runs, folder),
+        "monocular": lambda: monocular.monocular(videos),
     }
     made = []
     for name in args.names:
@@ -101,17 +107,18 @@ def run_tables(args: Args) -> list[Table]:
     return made
 
 
-def finished(args: Args) -> list[Finished]:
-    """The finished runs that `args` ask for, in the order of the avatars' names."""
-    folders = [args.out / "unica" / name / args.preset for name in args.avatars or known.names()]
-    there = [f for f in folders if (f / "metrics.json").is_file()]
-    missing = [f.parent.name for f in folders if f not in there]
+def folders(args: Args, system: str, options: str) -> list[Path]:
+    """The folders of finished runs of a system that `args` ask for, in the order of the avatars' names; `options` make
+    such a run. Raises ValueError where there is none."""
+    all_of_them = [args.out / system / name / args.preset for name in args.avatars or known.names()]
+    there = [f for f in all_of_them if (f / "metrics.json").is_file()]
+    missing = [f.parent.name for f in all_of_them if f not in there]
     if not there or (args.avatars and missing):
         raise ValueError(
-            f"no finished run of {', '.join(missing)} under {args.out / 'unica'}: "
-            f"train with python -m experiments.unica --avatar {missing[0]} --train --preset {args.preset}"
+            f"no finished run of {', '.join(missing)} under {args.out / system}: make it with "
+            f"python -m experiments.{system} {options.format(missing[0])} --preset {args.preset}"
         )
-    return [Finished(f) for f in there]
+    return there
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from avatarjax import cameras, rotations
@@ -30,11 +30,12 @@ _STEADINESS = 10.0
 _BACKGROUND = 0.93
 
 
-def following_camera(roots: Float[np.ndarray, "f 3"], size: int) -> Camera:
-    """A camera (f,) in front of a figure of up to two metres that moves along with its smoothed path (f, 3)."""
+def following_camera(roots: Float[np.ndarray, "f 3"], size: int, azimuth: float = 0.0) -> Camera:
+    """A camera (f,) that moves along with the smoothed path (f, 3) of a figure of up to two metres: in front of it, or
+    so many radians further round, towards +x."""
     smooth = ndimage.gaussian_filter1d(np.asarray(roots, np.float64), _STEADINESS, axis=0, mode="nearest")
     camera = cameras.orbit(
-        np.zeros(1), target=(0, 0.95, 0), distance=4.6, heights=0.4, width=size, height=size, fov_y=0.5
+        np.full(1, azimuth), target=(0, 0.95, 0), distance=4.6, heights=0.4, width=size, height=size, fov_y=0.5
     )
     moved = np.tile(np.eye(4), (len(smooth), 1, 1))
     moved[:, 0, 3], moved[:, 2, 3] = -smooth[:, 0], -smooth[:, 2]
@@ -79,15 +80,16 @@ def film(
     vertices = dressing.simulate(avatar, motion.transforms, config, progress=progress)
     camera = following_camera(np.asarray(motion.roots), size)
     renderer = MeshRenderer(avatar.faces, avatar.uvs, avatar.texture)
-    frames = []
+    shots = []
     for k, posed in enumerate(vertices):
-        frames.append(renderer.render(posed, jax.tree.map(lambda x, k=k: x[k], camera)))
+        shots.append(photograph(renderer, posed, jax.tree.map(lambda x, k=k: x[k], camera)))
         if progress:
             progress(1)
     poses = poses_of(avatar.rig, motion)
     new = folder.with_name(f".{folder.name}.new")
     shutil.rmtree(new, ignore_errors=True)
-    write_monocular(new, [_on_background(f) for f in frames], [f[..., 3] > 127 for f in frames], camera, poses)
+    images, masks = zip(*shots, strict=True)
+    write_monocular(new, list(images), list(masks), camera, poses)
     relative = (vertices - np.asarray(motion.hips)[:, None]).astype(np.float16)
     weights.save_tree(new / MESHES, {"vertices": relative, "faces": avatar.faces, "uvs": avatar.uvs})
     shutil.rmtree(folder, ignore_errors=True)
@@ -95,7 +97,11 @@ def film(
     return vertices
 
 
-def _on_background(rgba: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture before a plain wall."""
+def photograph(
+    renderer: MeshRenderer, vertices: Float[np.ndarray, "v 3"], camera: Camera
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """A picture of the mesh before a plain wall, and the mask of what is not the wall."""
+    rgba = renderer.render(vertices, camera)
     alpha = rgba[..., 3:].astype(np.float32) / 255
-    return np.round(rgba[..., :3] * alpha + 255 * _BACKGROUND * (1 - alpha)).astype(np.uint8)
+    picture = np.round(rgba[..., :3] * alpha + 255 * _BACKGROUND * (1 - alpha)).astype(np.uint8)
+    return picture, rgba[..., 3] > 127
