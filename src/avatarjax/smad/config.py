@@ -196,7 +196,7 @@ def _ci() -> SmadConfig:
             pose_width=64, pose_embedding=32, hidden=64, message=32, decoder=(64, 32), codes=4, strain=True
         ),
         dynamics=DynamicsConfig(
-            frames=8,
+            frames=16,
             target_stage=StageConfig(2_000, 64, 3e-3),
             stage=StageConfig(300, 4, 5e-4),
         ),

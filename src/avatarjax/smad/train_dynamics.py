@@ -1,7 +1,9 @@
 """Learning the dynamics from tracks: where nodes were in every frame of some takes (SMAD 3.2, Eqs. 9 and 11, B.3).
 
-Rollouts start in frames of the recording, a little wrong, and are trained through for some frames, so that the model
-learns to live with its own errors. Tracks come from the refined initialisation (`refine`), or from a mesh sequence.
+The equilibrium is learned from single frames. Rollouts then start at it in any frame and are trained through for some
+frames: from where the recording was, the system would learn to carry on what it cannot know in a rollout from rest.
+Without an equilibrium they start where the recording was, a little wrong, so that the model learns to live with its own
+errors. Tracks come from the refined initialisation (`refine`), or from a mesh sequence.
 """
 
 from __future__ import annotations
@@ -197,7 +199,10 @@ def train(config: SmadConfig, system: System, takes: Sequence[Take], run: Run) -
         system, recorded = batch["system"], batch["recorded"]
 
         def one(start, key):
-            state = shaken(config, system, state_at(config, params, system, recorded, start), key)
+            if config.equilibrium:
+                state = calm_at(config, params, system, recorded, start)
+            else:
+                state = shaken(config, system, state_at(config, params, system, recorded, start), key)
             states, _ = roll(config, params, system, recorded, state, start, frames)
             return losses(system, recorded.offsets[start + 1 + jnp.arange(frames)], states)
 
