@@ -67,7 +67,7 @@ def of_linear(config: SmadConfig, model: Linear, system: System) -> Method:
 
 def of_skinning(system: System) -> Method:
     """The driven surface alone."""
-    return lambda _, take: np.asarray(_surfaces(system, take.poses))
+    return lambda _, take: np.asarray(dynamics.surfaces(system, take.poses))
 
 
 def loose(offsets: Float[np.ndarray, "f n 3"]) -> Int[np.ndarray, " m"]:
@@ -183,6 +183,3 @@ def _known(nodes: np.ndarray | None) -> np.ndarray:
 
 def _after(poses):
     return jax.tree.map(lambda x: x[1:], poses)
-
-
-_surfaces = jax.jit(dynamics.surfaces)

@@ -129,11 +129,13 @@ def driven(system: System, pose: Pose) -> Float[Array, "n 3"]:
     return system.graph.positions if system.skin is None else skeletal.pose_points(system.skin, pose)
 
 
+@jax.jit
 def surfaces(system: System, poses: Pose) -> Float[Array, "t n 3"]:
     """The driven surface under every one of t poses, in the body frame of each."""
     return jax.lax.map(lambda pose: driven(system, pose), poses)
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def pose_features(config: SmadConfig, system: System, poses: Pose) -> Float[Array, "t p"]:
     """Normalised features of every one of t poses; before the first the body is taken to have stood still."""
     return (driving.track(poses, config.dt) - system.scaling.pose_mean[None]) / system.scaling.pose_scale[None]
