@@ -169,7 +169,7 @@ def test_published_sizes():
     """Tables G and H by hand, with the head for opacity that only Eq. 8 has."""
     config = DeformerConfig(adaptive_stiffness=False, codes=0)
     shapes = functional.shapes(Deformer, config)
-    embedding = (6 * 72 * 256 + 256 + 512) + 2 * (256 * 256 + 256 + 512) + (256 * 128 + 128)
+    embedding = (8 * 72 * 256 + 256 + 512) + 2 * (256 * 256 + 256 + 512) + (256 * 128 + 128)
     assert functional.count(shapes["pose"]) == embedding
     projection = (3 + 3 * 12 + 128) * 256 + 256
     messages = 519 * 128 + 128
