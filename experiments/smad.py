@@ -212,7 +212,9 @@ def learn(
     if shots.rig is not None:
         skin = skeletal.bind(shots.rig, shots.pose(0, 0), net.positions)
     tracks = [Take(driving.recorded(take.poses), refine.tracks(fitted, k)) for k, take in enumerate(takes)]
-    system = train_dynamics.fit_system(config, net, skin, tracks)
+    # No drape: it would carry the tracks' errors on, which are a camera's, and pictures could not mend it.
+    without = dataclasses.replace(config, dynamics=dataclasses.replace(config.dynamics, components=0))
+    system = train_dynamics.fit_system(without, net, skin, tracks)
     # Tracks of one camera are mostly what it does not see: pictures have the last word on all that they began.
     params = train_dynamics.train_target(config, system, train_dynamics.record(config, system, tracks), run)
     avatar = smad.Avatar(fitted.gaussians, fitted.warp.binding, system, params, config)
