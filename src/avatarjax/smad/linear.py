@@ -54,8 +54,7 @@ def fit(
     of the take that a frame belongs to, before which the body is taken to have stood still.
 
     components: no more than there are coordinates. ridge: of the squared weights against a frame's squared error, pose
-    features and components being of unit size. Raises ValueError for fewer frames than
-    components.
+    features and components being of unit size. Raises ValueError for fewer frames than components.
     """
     count = len(offsets)
     if count < components:

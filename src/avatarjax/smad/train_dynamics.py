@@ -123,9 +123,7 @@ def state_at(config: SmadConfig, params: Params, system: System, recorded: Recor
 def calm_at(config: SmadConfig, params: Params, system: System, recorded: Recorded, frame: Int[Array, ""]) -> State:
     """The state of a frame as if the offsets had always been at their equilibrium, whatever was recorded."""
     back = _back(config, recorded, frame)
-    offsets = jax.vmap(lambda window: dynamics.settled(config, params, system, window))(
-        _windows(config, recorded, back)
-    )
+    offsets = _settled(config, params, system, recorded, back)
     return _state(config, recorded, back, offsets, offsets[:2])
 
 
