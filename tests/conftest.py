@@ -26,6 +26,11 @@ jax.config.update("jax_compilation_cache_dir", os.environ.setdefault("AVATARJAX_
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
+def pytest_collection_modifyitems(items):
+    """Whole experiments, which take minutes each, come first: then processes that share the files end together."""
+    items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
+
+
 @pytest.fixture
 def key():
     """A PRNG key; split it where more than one is needed."""

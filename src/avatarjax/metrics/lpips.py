@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from avatarjax.metrics import pretrained
 from avatarjax.metrics.image import Images, check_images
 
 NAMES = ("alex", "vgg")
@@ -47,6 +46,9 @@ def load(name: str = "alex") -> Network:
     """The trained network. Raises ValueError with the command that fetches the weights where they are missing."""
     if name not in NAMES:
         raise ValueError(f"unknown LPIPS network {name!r}: choose one of {', '.join(NAMES)}")
+    # Not above: the package imports this module before `python -m avatarjax.metrics.pretrained` runs that one.
+    from avatarjax.metrics import pretrained
+
     found = pretrained.load(name)
     backbone = found["AlexNet_0" if name == "alex" else "VGG16_0"]
     layers = [backbone[f"Conv_{k}"] for k in range(len(backbone))]
