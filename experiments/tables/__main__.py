@@ -11,11 +11,13 @@
     python -m experiments.tables sliding                       # Fig. 6: 2,000 frames, minutes an avatar
     python -m experiments.tables components novelty trail strips   # Figs. B, C (f), 5, I to L
     python -m experiments.tables monocular --preset ci         # SMAD's Tables 1, 3 and I
+    python -m experiments.tables initialisation --preset ci --avatars cowgirl    # SMAD's Fig. 6, right; minutes
 
 Runs are those of `python -m experiments.unica --avatar NAME --train` under OUT/unica/NAME/PRESET, and for `monocular`
-those of `python -m experiments.smad --avatar NAME` under OUT/smad/NAME/PRESET. Results go to
-OUT/tables/PRESET/: NAME.md with its pictures, and what was measured in cells.json, so that an interrupted table goes
-on. SV4D and the user study of UNICA are not reproduced; SMAD's Tables 2 and 4 to K: experiments.smad_dynamics.
+and `initialisation` those of `python -m experiments.smad --avatar NAME` under OUT/smad/NAME/PRESET; `initialisation`
+needs no more than their stage `film`. Results go to OUT/tables/PRESET/: NAME.md with its pictures, and what was
+measured in cells.json, so that an interrupted table goes on. SV4D and the user study of UNICA are not reproduced;
+SMAD's Tables 2 and 4 to K: experiments.smad_dynamics.
 """
 
 from __future__ import annotations
@@ -32,7 +34,18 @@ from avatarjax.io import atomic
 from avatarjax.metrics import environment
 from avatarjax.unica.config import DynamicsName, PresetName
 from experiments import command_line
-from experiments.tables import context, feed_forward, figures, images, long, monocular, quality, resolution, summary
+from experiments.tables import (
+    context,
+    feed_forward,
+    figures,
+    images,
+    initialisation,
+    long,
+    monocular,
+    quality,
+    resolution,
+    summary,
+)
 from experiments.tables.finished import Finished
 from experiments.tables.table import Notebook, Table
 
@@ -51,6 +64,7 @@ Name = typing.Literal[
     "trail",
     "strips",
     "monocular",
+    "initialisation",
 ]
 
 
@@ -75,7 +89,12 @@ class Args:
 def run_tables(args: Args) -> list[Table]:
     """Measure, print and write the tables. Raises ValueError where there is no finished run."""
     videos = folders(args, "smad", "--avatar {}") if "monocular" in args.names else []
-    others = set(args.names) - {"monocular"}
+    films = (
+        folders(args, "smad", "--stage film --avatar {}", initialisation.filmed)
+        if "initialisation" in args.names
+        else []
+    )
+    others = set(args.names) - {"monocular", "initialisation"}
     runs = [Finished(f) for f in folders(args, "unica", "--avatar {} --train")] if others else []
     folder = args.out / "tables" / args.preset
     folder.mkdir(parents=True, exist_ok=True)
@@ -95,6 +114,7 @@ def run_tables(args: Args) -> list[Table]:
         "trail": lambda: figures.trail(runs, folder),
         "strips": lambda: figures.strips(runs, folder),
         "monocular": lambda: monocular.monocular(videos),
+        "initialisation": lambda: initialisation.initialisation(films, notebook, folder),
     }
     made = []
     for name in args.names:
@@ -107,11 +127,16 @@ def run_tables(args: Args) -> list[Table]:
     return made
 
 
-def folders(args: Args, system: str, options: str) -> list[Path]:
-    """The folders of finished runs of a system that `args` ask for, in the order of the avatars' names; `options` make
-    such a run. Raises ValueError where there is none."""
+def measured(folder: Path) -> bool:
+    """Whether a run is finished."""
+    return (folder / "metrics.json").is_file()
+
+
+def folders(args: Args, system: str, options: str, done: Callable[[Path], bool] = measured) -> list[Path]:
+    """The folders of the runs of a system that `args` ask for and that are done, in the order of the avatars' names;
+    `options` make such a run. Raises ValueError where there is none."""
     all_of_them = [args.out / system / name / args.preset for name in args.avatars or known.names()]
-    there = [f for f in all_of_them if (f / "metrics.json").is_file()]
+    there = [f for f in all_of_them if done(f)]
     missing = [f.parent.name for f in all_of_them if f not in there]
     if not there or (args.avatars and missing):
         raise ValueError(

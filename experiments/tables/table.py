@@ -13,7 +13,7 @@ from avatarjax.io import atomic
 from avatarjax.metrics.published import Published
 from avatarjax.metrics.statistics import Estimate
 
-BETTER = {"FVD": min, "PSNR": max, "LPIPS": min}
+BETTER = {"FVD": min, "PSNR": max, "SSIM": max, "LPIPS": min}
 
 
 @dataclasses.dataclass

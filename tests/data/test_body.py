@@ -80,3 +80,16 @@ def test_the_asset_is_reproducible(tmp_path):
     out = tmp_path / "human.safetensors"
     assets.main(assets.Config(mpfb2=Path(raw) / "mpfb2", emotes=Path(raw) / "dcl_emotes", out=out))
     assert out.read_bytes() == bodies.ASSET.read_bytes()
+
+
+@pytest.mark.parametrize("macro", [FEMALE, {"caucasian-male-old": 0.25, "caucasian-male-young": 0.75}])
+def test_a_shape_is_found_again_by_its_joints_on_any_ground(body, macro):
+    _, rig = bodies.shape(body, macro)
+    found = bodies.fit(body, rig.heads + np.array([0, 0.3, 0], np.float32))
+    assert all(abs(weight - macro.get(name, 0)) < 1e-3 for name, weight in found.items())
+    assert set(macro) <= set(found)
+
+
+def test_joints_of_another_number_are_no_body(body):
+    with pytest.raises(ValueError, match=r"\(3, 3\) joints: the body has \d+, Hips"):
+        bodies.fit(body, np.zeros((3, 3)))

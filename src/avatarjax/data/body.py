@@ -11,6 +11,7 @@ from pathlib import Path
 import flax.struct
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy import optimize
 
 from avatarjax.io import weights
 
@@ -108,6 +109,21 @@ def shape(body: Body, macro: Mapping[str, float]) -> tuple[Float[np.ndarray, "v 
     ground = np.array([0.0, vertices[skin, 1].min(), 0.0], np.float32)
     vertices, joints = vertices - ground, joints - ground
     return vertices, Rig(joints[:, 0], joints[:, 1], _soles(body, vertices), body.names, body.parents)
+
+
+def fit(body: Body, heads: Float[np.ndarray, "j 3"]) -> dict[str, float]:
+    """The macro weights, none below zero, with which `shape` brings the joints nearest to given ones (j, 3), in metres
+    and in the order of the body's, wherever their ground is; targets of no weight are left out.
+
+    Least squares. Raises ValueError for another number of joints.
+    """
+    if heads.shape != body.joints[:, 0].shape:
+        raise ValueError(f"{heads.shape} joints: the body has {len(body.names)}, {', '.join(body.names)}")
+    names = sorted(body.targets)
+    up = np.tile([0.0, 1.0, 0.0], len(heads))
+    columns = [*(body.target_joints[name][:, 0].ravel() for name in names), up, -up]
+    found, _ = optimize.nnls(np.stack(columns, axis=1).astype(np.float64), (heads - body.joints[:, 0]).ravel())
+    return {name: float(weight) for name, weight in zip(names, found, strict=False) if weight > 0}
 
 
 def _soles(body: Body, vertices: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from avatarjax.cameras import Camera
 from avatarjax.io import exr
@@ -67,6 +67,17 @@ class MonocularVideo:
         return self.camera.replace(
             world_to_camera=self.camera.world_to_camera[frame], intrinsics=self.camera.intrinsics[frame]
         )
+
+    def only(self, frames: Int[np.ndarray, " k"]) -> MonocularVideo:
+        """The video of some frames (k,), counted from 0, in this order and in memory; `fps` stays what it was."""
+        camera, poses = self.camera, self.poses
+        if camera.world_to_camera.ndim == 3:
+            camera = camera.replace(
+                world_to_camera=camera.world_to_camera[frames], intrinsics=camera.intrinsics[frames]
+            )
+        parts = {name: getattr(poses, name)[frames] for name in ("rotations", "root_rotation", "root_translation")}
+        chosen = {"masks": self.masks[frames], "camera": camera, "poses": dataclasses.replace(poses, **parts)}
+        return dataclasses.replace(self, **chosen, _loaded=self.images()[frames])
 
     def held(self) -> MonocularVideo:
         """The same video with all of its frames in memory."""

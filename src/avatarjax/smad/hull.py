@@ -72,12 +72,9 @@ def initialise(video: MonocularVideo, config: HullConfig = HullConfig()) -> Gaus
     Raises ValueError where masks are empty or do not fit the camera, and where no voxel lies in enough silhouettes.
     """
     chosen = views.spread(len(video), config.frames)
-    cameras, masks = views.of_video(video, chosen), video.masks[chosen]
-    hull = carve(masks, cameras, config)
+    hull = carve(video.masks[chosen], views.of_video(video, chosen), config)
     points, normals = shell(hull)
-    wanted = set(chosen.tolist())
-    pictures = (frame for k, frame in enumerate(video.frames()) if k in wanted)
-    colors = paint(points, normals, float(hull.grid.edge), pictures, masks, cameras)
+    colors = paint_from(video, chosen, points, normals, float(hull.grid.edge))
     return voxels.to_gaussians(points, colors, config.gaussians, config.opacity)
 
 
@@ -151,6 +148,19 @@ def paint(
     colors = np.asarray(sums) / np.where(seen, total, 1)[:, None]
     _, nearest = cKDTree(points[seen]).query(points)
     return colors[seen][nearest]
+
+
+def paint_from(
+    video: MonocularVideo,
+    frames: Int[np.ndarray, " k"],
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    edge: float,
+) -> Float[np.ndarray, "n 3"]:
+    """`paint` with some frames of a video, by their rising numbers (k,); points lie in the body frame."""
+    wanted = set(frames.tolist())
+    pictures = (frame for k, frame in enumerate(video.frames()) if k in wanted)
+    return paint(points, normals, edge, pictures, video.masks[frames], views.of_video(video, frames))
 
 
 def _allowed(masks: Bool[Array, "f h w"], cameras: Camera, grid: Grid, config: HullConfig) -> Bool[np.ndarray, "x y z"]:

@@ -83,13 +83,14 @@ class Refined:
 
 
 class Quality(typing.NamedTuple):
-    """Means over held-out frames: PSNR in dB of the whole picture over black and, the honest number, of the pixels of
-    the mask; SSIM; LPIPS where weights were given."""
+    """How well k held-out frames are drawn, by their numbers among all frames: PSNR in dB of the whole picture over
+    black and, the honest number, of the pixels of the mask; SSIM; LPIPS where weights were given."""
 
-    psnr: float
-    masked_psnr: float
-    ssim: float
-    lpips: float | None
+    frames: Int[np.ndarray, " k"]
+    psnr: Float[np.ndarray, " k"]
+    masked_psnr: Float[np.ndarray, " k"]
+    ssim: Float[np.ndarray, " k"]
+    lpips: Float[np.ndarray, " k"] | None
 
 
 @typing.no_type_check
@@ -208,8 +209,8 @@ def tracks(refined: Refined, take: int) -> Float[Array, "f n 3"]:
 
 
 def quality(refined: Refined, takes: Footage, perceptual: lpips.Network | None = None) -> Quality:
-    """How well held-out frames are drawn; raises ValueError where a mask in every one of them is empty or there is
-    none, which is so for takes of two frames."""
+    """How well each held-out frame with a person in its mask is drawn; raises ValueError where there is none, which is
+    so for takes of two frames."""
     frames = np.flatnonzero(takes.held_out & (takes.rgba[..., 3] > 127).any((1, 2)))
     if not len(frames):
         raise ValueError(f"takes of {takes.takes} frames have none to hold out with a person in it: give longer ones")
@@ -222,8 +223,8 @@ def quality(refined: Refined, takes: Footage, perceptual: lpips.Network | None =
         truth, inside = rgba[..., :3], (rgba[..., 3:] > 0.5).astype(jnp.float32)
         values = [image.psnr(drawn, truth), image.masked_psnr(drawn, truth, inside), image.ssim(drawn, truth)]
         found.append(values + ([] if perceptual is None else [lpips.distance(perceptual, drawn, truth)]))
-    means = [float(x) for x in np.mean(jax.device_get(found), axis=0)]
-    return Quality(means[0], means[1], means[2], None if perceptual is None else means[3])
+    columns = np.asarray(jax.device_get(found), np.float32).T
+    return Quality(frames, *columns[:3], None if perceptual is None else columns[3])
 
 
 def optimiser(config: RefineConfig) -> optax.GradientTransformation:
