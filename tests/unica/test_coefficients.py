@@ -199,6 +199,27 @@ def test_scaling_brings_increments_to_unit_size(coefficient_frames, coefficient_
     np.testing.assert_allclose(np.mean(scaling.weight), 1, rtol=1e-5)
 
 
+def test_without_temperature_nothing_is_left_to_chance(config, coefficient_dynamics, contexts, key):
+    cold = dataclasses.replace(config.coefficients, temperature=0.0)
+    dynamics = coefficient_dynamics.replace(params=random_params(co.CoefficientDenoiser, cold, scale=0.05))
+    one, other = (sample(cold, dynamics, k, contexts, jnp.ones(5, jnp.int32))[0] for k in (key, jax.random.key(1)))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_a_temperature_out_of_range_is_refused():
+    with pytest.raises(ValueError, match=r"the temperature is 1\.5"):
+        co.CoefficientConfig(temperature=1.5)
+
+
+def test_training_does_not_depend_on_how_an_avatar_samples(config, coefficient_dynamics, contexts, key):
+    target = jnp.repeat(contexts.pose[:, 2:], 2, 1), jnp.repeat(contexts.root[:, 2:], 2, 1)
+    loss = jax.jit(co.rollout_loss, static_argnums=0)
+    ways = (dict(sample_steps=1, temperature=1.0), dict(sample_steps=3, temperature=0.2))
+    settings = (dataclasses.replace(config.coefficients, **way) for way in ways)
+    one, other = (loss(s, coefficient_dynamics, key, contexts, *target, jnp.ones((5, 2), jnp.int32)) for s in settings)
+    assert one == other
+
+
 def test_losses_are_finite_and_have_gradients(config, coefficient_dynamics, contexts, key):
     settings = dataclasses.replace(config.coefficients, sample_steps=1)
     params = random_params(co.CoefficientDenoiser, settings, scale=0.05)

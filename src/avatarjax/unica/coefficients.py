@@ -43,7 +43,8 @@ class CoefficientConfig:
     sigma_min: float = 0.03
     sigma_max: float = 5.0
     at_sigma_max: float = 0.4
-    sample_steps: int = 1
+    sample_steps: int = 2
+    temperature: float = 0.5  # size of the noise that sampling starts from; 0: no chance at all
     context_noise: float = 1.0
     clean_contexts: float = 0.2
     rollout_frames: int = 8
@@ -53,6 +54,16 @@ class CoefficientConfig:
     def __post_init__(self):
         if not 1 <= self.context <= CONTEXT:
             raise ValueError(f"the model looks at 1, 2 or 3 context frames, not {self.context}")
+        if not 0 <= self.temperature <= 1:
+            raise ValueError(f"the temperature is {self.temperature}: it must lie in 0..1")
+
+    @property
+    def rough(self) -> CoefficientConfig:
+        """With the sampler of training: one step from full noise.
+
+        It is the cheapest, and what a model has learned to undo of it covers what better samplers leave behind.
+        """
+        return dataclasses.replace(self, sample_steps=1, temperature=1.0)
 
     @property
     def features(self) -> int:
@@ -216,9 +227,13 @@ def sample(
     context: Context,
     action: Int[Array, "b"],
 ) -> tuple[Float[Array, "b k"], Float[Array, "b 3"]]:
-    """The next pose and the next root in the world, for a batch of contexts (b, 3, ...)."""
+    """The next pose and the next root in the world, for a batch of contexts (b, 3, ...).
+
+    A colder start keeps draws near the middle of the distribution: what is left of the first noise after few steps is
+    a tremble, not diversity.
+    """
     network = _network(config, dynamics, context, jnp.zeros((action.shape[0], CONTEXT)), action)
-    noise = jax.random.normal(key, (action.shape[0], config.features))
+    noise = config.temperature * jax.random.normal(key, (action.shape[0], config.features))
     increment = edm.euler(network, noise, edm.sigma_steps(config.sample_steps, config.sigma_min, config.sigma_max))
     pose_step = increment[:, : config.components] * dynamics.scaling.step_scale[None]
     root_step = increment[:, config.components :] * dynamics.scaling.root_scale[None]
@@ -301,7 +316,8 @@ def rollout_loss(
 ) -> Float[Array, ""]:
     """Rollout training: contexts are what the model itself produced over up to u frames, targets the recorded frames.
 
-    The produced contexts carry no gradient; the loss teaches the model to undo its own drift (self forcing).
+    The produced contexts, roughly sampled, carry no gradient; the loss teaches the model to undo its own drift (self
+    forcing).
     """
     noise_key, roll_key, loss_key = jax.random.split(key, 3)
     b, u = actions.shape
@@ -310,7 +326,7 @@ def rollout_loss(
 
     def step(context, inputs):
         key, action = inputs
-        pose, root = sample(config, frozen, key, context, action)
+        pose, root = sample(config.rough, frozen, key, context, action)
         return push(context, pose, root), context
 
     _, contexts = jax.lax.scan(step, start, (jax.random.split(roll_key, u), actions.T))

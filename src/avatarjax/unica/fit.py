@@ -110,14 +110,15 @@ def fit_stance(
 ) -> Stance | None:
     """What a trained model needs for `stance.hold`: soles, and the covariance of its one-step errors.
 
-    Errors are those on the given contexts, of training data. None where no soles are found.
+    Errors are those of rough samples on the given contexts, of training data. None where no soles are found.
     """
     found = stance.find_soles(
         *(np.asarray(x) for x in (recording.texels, recording.roots, recording.sequence, standing))
     )
     if found is None:
         return None
-    pose, root = jax.jit(coefficients.sample, static_argnums=0)(config, dynamics, key, context, jnp.asarray(action))
+    sample = jax.jit(coefficients.sample, static_argnums=0)
+    pose, root = sample(config.rough, dynamics, key, context, jnp.asarray(action))
     newest = context.root[:, 2]
     missed = coefficients.relative(root, newest) - coefficients.relative(target_root, newest)
     errors = np.asarray(jnp.concatenate([pose - target_pose, missed], axis=-1), np.float64)

@@ -246,7 +246,7 @@ def train_coefficients(config: UnicaConfig, data: Dataset, run: Run) -> Coeffici
         roll_loss = jax.lax.cond(batch["rolling"], rolled, lambda _: single_loss, None)
         return 0.5 * (single_loss + roll_loss), {"single": single_loss, "rollout": roll_loss}
 
-    trained = start.replace(params=train_stage(run, "coefficients", stage, settings, loss, linear, batch_at))
+    trained = start.replace(params=train_stage(run, "coefficients", stage, settings.rough, loss, linear, batch_at))
     actions = data.train.actions[everything[:, 2]]
     held = closed_form.fit_stance(
         settings, trained, data.train, data.standing, known, *wanted, actions, run.key("stance")
