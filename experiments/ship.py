@@ -52,13 +52,17 @@ def ship(run: Path, /, seed: int = 0) -> Path:
         "environment": environment.describe(),
         "metrics": {key: measured[key] for key in ("images", "turning", "stages", "foot_slide_mm")},
     }
-    files.save(path, avatar, half=True, made=made)
-    before, after = headings(avatar), headings(unica.load(path))
-    print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB")
-    print(f"heading errors, degrees: {np.round(before, 2).tolist()} trained, {np.round(after, 2).tolist()} in the file")
-    if not (after < before + _WORSE).all():
-        path.unlink()
-        raise ValueError(f"in half precision {name} obeys its keys worse than before: not shipped")
+    candidate = path.with_suffix(".candidate")
+    try:
+        files.save(candidate, avatar, half=True, made=made)
+        before, after = headings(avatar), headings(unica.load(candidate))
+        print(f"{path.name}: {candidate.stat().st_size / 1e6:.1f} MB")
+        print(f"heading errors, degrees: {np.round(before, 2).tolist()} trained, {np.round(after, 2).tolist()} shipped")
+        if not (after < before + _WORSE).all():
+            raise ValueError(f"in half precision {name} obeys its keys worse than before: not shipped")
+        candidate.replace(path)
+    finally:
+        candidate.unlink(missing_ok=True)
     return path
 
 

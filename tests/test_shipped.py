@@ -1,5 +1,7 @@
 """The avatars that come with the package: whole, small, and obedient."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -75,3 +77,20 @@ def test_the_main_command_shows_it(tmp_path, monkeypatch):
 def test_a_run_without_a_report_is_not_shipped(tmp_path):
     with pytest.raises(ValueError, match=r"has no metrics\.json"):
         ship.ship(tmp_path)
+
+
+def test_what_obeys_worse_does_not_replace_what_was_shipped(tmp_path, monkeypatch):
+    run, shelf = tmp_path / "cowgirl" / "small", tmp_path / "shelf"
+    run.mkdir(parents=True)
+    shelf.mkdir()
+    files.save(run / files.file_name("coefficients"), aj.load(files.shipped()["cowgirl"]))
+    measured = {key: {} for key in ("seconds", "images", "turning", "stages", "foot_slide_mm")}
+    (run / "metrics.json").write_text(json.dumps(measured))
+    (shelf / "cowgirl.safetensors").write_bytes(b"what was there")
+    monkeypatch.setattr(files, "SHIPPED", shelf)
+    errors = iter([np.array([1.0]), np.array([5.0])])
+    monkeypatch.setattr(ship, "headings", lambda avatar: next(errors))
+    with pytest.raises(ValueError, match="obeys its keys worse"):
+        ship.ship(run)
+    assert [p.name for p in shelf.iterdir()] == ["cowgirl.safetensors"]
+    assert (shelf / "cowgirl.safetensors").read_bytes() == b"what was there"
