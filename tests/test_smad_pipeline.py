@@ -14,9 +14,11 @@ from avatarjax.smad import config as configs
 from avatarjax.smad import driving
 from avatarjax.smad.config import DynamicsConfig, FilmConfig, PicturesConfig
 from avatarjax.smad.graph import GraphConfig
+from avatarjax.smad.radiance_field import FieldConfig
 from avatarjax.train import StageConfig
 from experiments import smad as experiment
 from experiments.tables import __main__ as tables
+from experiments.tables import initialisation
 
 CI = configs.preset("ci")
 FRAMES = 26
@@ -87,6 +89,25 @@ def test_a_table_is_made_of_it(finished):
     assert row[6].mean == found["novel views"]["ours"]["PSNR"]["mean"]
     assert row[-1].mean == found["nodes"]["loose nodes"]["ours"]["mean"]
     assert any("PSNR: best in the paper ours, here" in remark for remark in table.remarks)
+
+
+def test_what_gaussians_begin_with_is_compared(finished, capsys, monkeypatch):
+    """Of the films of a run; a second table measures nothing."""
+    monkeypatch.setitem(initialisation.FIELDS, "ci", FieldConfig(cells=16, width=8, layers=2, steps=60, kappa=0.05))
+    monkeypatch.setattr(initialisation, "SEEDS", (0,))
+    args = tables.Args(("initialisation",), preset="ci", avatars=("ghostlady",), out=finished.parents[2])
+    (table,) = tables.run_tables(args)
+    kinds = [tuple(row[1:3]) for row in table.rows[::2]]
+    assert kinds == [(m, s) for m in initialisation.METHODS for s in initialisation.STATES]
+    for row in table.rows:
+        psnr, *_, ssim, _ = row[6:]
+        assert 5 < psnr.mean < 50 and 0 < ssim.mean < 1 and 20 < row[3] < 400
+        assert psnr.n == 5
+    assert sum("radiance field less body template" in remark for remark in table.remarks) >= 4
+    assert (finished.parents[2] / "tables" / "ci" / "initialisation.png").stat().st_size > 1000
+    assert "measuring" in capsys.readouterr().out
+    (again,) = tables.run_tables(args)
+    assert again.markdown() == table.markdown() and "measuring" not in capsys.readouterr().out
 
 
 def test_a_second_run_reuses_and_a_stage_runs_anew(finished, capsys):
