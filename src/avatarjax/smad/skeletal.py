@@ -9,6 +9,7 @@ from __future__ import annotations
 import typing
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -68,10 +69,9 @@ def inverse_distances(
 ) -> Float[Array, "n j"]:
     """Weights (n, j) by distances to bones, rows sum to 1. A joint's bone reaches to its children's joints."""
     children = np.flatnonzero(parents >= 0)
-    apart = jnp.stack([_distance(points, joints[j], joints[j]) for j in range(len(parents))])
-    for child in children:
-        parent = int(parents[child])
-        apart = apart.at[parent].min(_distance(points, joints[parent], joints[child]))
+    above = parents[children]
+    distances = jax.vmap(_distance, in_axes=(None, 0, 0))
+    apart = distances(points, joints, joints).at[above].min(distances(points, joints[above], joints[children]))
     # A millimetre keeps a point on a bone from having an infinite weight.
     closeness = (jnp.min(apart, axis=0, keepdims=True) + 1e-3) / (apart + 1e-3)
     weights = closeness**sharpness
