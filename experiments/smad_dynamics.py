@@ -17,7 +17,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -28,32 +27,32 @@ import numpy as np
 from avatarjax import smad
 from avatarjax.data import avatars
 from avatarjax.io import atomic
-from avatarjax.metrics import environment, published
-from avatarjax.metrics.statistics import Estimate, bootstrap, paired_t_test
+from avatarjax.metrics import environment
 from avatarjax.smad import dynamics, linear, train_dynamics
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.dynamics import System
 from avatarjax.smad.train_dynamics import Take
-from avatarjax.train import Run
-from experiments import command_line, pictures
+from avatarjax.train import Run, read_metrics
+from experiments import command_line, smad_dynamics_tables
 from experiments import smad_dynamics_measures as measures
 from experiments.smad_dynamics_measures import Found, Method
+from experiments.smad_dynamics_tables import (
+    DAMPING,
+    ISOMETRY,
+    LENGTH,
+    MEAN,
+    OURS,
+    POSES,
+    RIDGE,
+    SKINNING,
+    SPACE,
+    TWINS,
+    Results,
+)
 from experiments.smad_motions import Motions, Name, Stage, all_of, on_nodes
-from experiments.tables.table import Table
 
 MOTIONS = Motions()
-PARTS = ("train", "test", "unseen")
-TWINS, SKINNING, MEAN, RIDGE, SPACE, POSES, OURS = (
-    "twins",
-    "skinning",
-    "mean drape",
-    "ridge regression",
-    "linear state space",
-    "pose window alone",
-    "ours",
-)
-Results = dict[str, list[Found]]  # by method, of every seed
-YARDSTICKS = (SKINNING, MEAN, RIDGE, SPACE, POSES)
+MEASURES = 2  # which version of the measures: kept ones of another are taken anew
 
 
 def _net(config: SmadConfig, **changes: typing.Any) -> SmadConfig:
@@ -68,9 +67,10 @@ def _nodes(config: SmadConfig, times: float) -> SmadConfig:
     return dataclasses.replace(config, graph=dataclasses.replace(config.graph, nodes=round(times * config.graph.nodes)))
 
 
-def _longer(config: SmadConfig, times: int) -> SmadConfig:
-    stage = config.dynamics.target_stage
-    return _losses(config, target_stage=dataclasses.replace(stage, steps=times * stage.steps))
+def _longer(config: SmadConfig, times: float) -> SmadConfig:
+    stages = {name: getattr(config.dynamics, name) for name in ("target_stage", "stage")}
+    counts = {name: max(1, round(times * stage.steps)) for name, stage in stages.items()}
+    return _losses(config, **{name: dataclasses.replace(stages[name], steps=n) for name, n in counts.items()})
 
 
 def _regular(config: SmadConfig) -> SmadConfig:
@@ -100,11 +100,9 @@ LEARNED: dict[str, Callable[[SmadConfig], SmadConfig]] = {
     "C1 half the nodes": lambda c: _nodes(c, 0.5),
     "C3 twice the nodes": lambda c: _nodes(c, 2.0),
     "equilibrium of the network alone": lambda c: _losses(c, components=0),
-    "equilibrium 4 times as long": lambda c: _longer(c, 4),
-    "isometry 0": lambda c: _losses(c, isometry=0.0),
-    "isometry 0.1": lambda c: _losses(c, isometry=0.1),
-    "damping 0": lambda c: _losses(c, damping=0.0),
-    "damping 0.1": lambda c: _losses(c, damping=0.1),
+    **{f"{ISOMETRY}{w:g}": lambda c, w=w: _losses(c, isometry=w) for w in (0.0, 0.01, 0.1, 1.0)},
+    **{f"{DAMPING}{w:g}": lambda c, w=w: _losses(c, damping=w) for w in (0.0, 0.01, 0.1, 1.0)},
+    **{f"{times:g}{LENGTH}": lambda c, times=times: _longer(c, times) for times in (0.1, 0.3, 3.0)},
 }
 
 
@@ -197,6 +195,9 @@ def one(
     loose = measures.loose(np.asarray(recorded.offsets))
     skinned = measures.of_skinning(system)
     found = {label: measures.measure(method, parts, loose, skinned) for label, method in methods.items()}
+    found[name]["seconds"] = sum(r[-1]["seconds"] for p in place.glob("*.jsonl") if (r := read_metrics(p)))
+    if name == OURS:
+        found[name]["similarity"] = measures.similarity(config, system, parts)
     atomic.write_text(path, json.dumps({"mark": mark, "found": found}))
     if name == OURS:
         show = next(iter(parts["test"]))
@@ -206,7 +207,8 @@ def one(
 
 def fingerprint(config: SmadConfig, stage: Stage, motions: Motions, seed: int) -> str:
     """What tells a measurement from others."""
-    return hashlib.sha256(f"{config} {stage.name} {stage.config} {motions} {seed}".encode()).hexdigest()[:12]
+    what = f"{MEASURES} {config} {stage.name} {stage.config} {motions} {seed}"
+    return hashlib.sha256(what.encode()).hexdigest()[:12]
 
 
 def yardsticks(config: SmadConfig, params: typing.Any, system: System, recorded: typing.Any) -> dict[str, Method]:
@@ -238,163 +240,19 @@ def twins(stage: Stage, chosen: np.ndarray, motions: Motions) -> Method:
 def report(args: Args, config: SmadConfig, results: dict[int, Results], folder: Path) -> None:
     """Write dynamics.json, dynamics.md and plots, and print the tables; `results` by number of motions."""
     made_on = ", ".join(f"{key} {value}" for key, value in environment.describe().items())
-    made = [table.markdown() for table in tables(args, config, results)]
-    command = f"python -m experiments.smad_dynamics --avatar {args.avatar} --preset {args.preset}"
-    command += f" --seeds {args.seeds} --motions {' '.join(map(str, args.motions))}"
-    text = "\n".join([*made, f"`{command}` on {made_on}.", ""])
-    atomic.write_text(folder / "dynamics.md", text)
-    atomic.write_text(folder / "dynamics.json", json.dumps(results, indent=1))
-    print(text, flush=True)
-    first = results[args.motions[0]]
-    shown = [name for name in (SKINNING, RIDGE, OURS, "B0 no velocities") if name in first]
-    for kind in MOTIONS.long:
-        label = measures.label(kind)
-        lines = {n: np.array(first[n][0]["long"][label]["curve"]) for n in shown if label in first[n][0]["long"]}
-        x = {n: np.stack([np.arange(len(y)) * measures.BLOCK / 30, y], axis=1) for n, y in lines.items()}
-        pictures.plot_lines(folder / f"long-{label}.png", x, "seconds", "error of loose nodes, mm")
-
-
-def tables(args: Args, config: SmadConfig, results: dict[int, Results]) -> list[Table]:
-    """All tables of the results that there are."""
     steps = config.dynamics.target_stage.steps, config.dynamics.stage.steps
     about = (
         f"{args.avatar}, {args.preset}, {config.graph.nodes} nodes; {args.motions[0]} motions to learn from; "
         f"learned methods: {steps[0]} steps of the equilibrium and {steps[1]} of rollouts, {args.seeds} seed(s). "
     )
-    first = results[args.motions[0]]
-    made = [main_table(about, first), swing_table(first)]
-    if any(name in first for name in LEARNED if name != OURS):
-        made.append(paper_table(first))
-    if len(results) > 1:
-        made.append(data_table(results))
-    return [*made, long_table(first)]
-
-
-def data_table(results: dict[int, Results]) -> Table:
-    """What more motions to learn from are worth."""
-    rows = []
-    for count in sorted(results):
-        found = results[count]
-        cells = [across(found[name], "test", "loose") for name in (MEAN, RIDGE, SPACE, POSES, OURS)]
-        unseen = [across(found[name], "unseen", "loose") for name in (RIDGE, OURS)]
-        rows.append([count, *cells, compared(found[OURS], found[RIDGE], "test"), *unseen])
-    return Table(
-        "How much motion it is learned from",
-        "Loose nodes, mm; the same motions of the test throughout, the learned methods trained for the same steps. p: "
-        "ours against ridge regression.",
-        ["motions", MEAN, RIDGE, SPACE, POSES, OURS, "p", f"unseen, {RIDGE}", f"unseen, {OURS}"],
-        rows,
-    )
-
-
-def main_table(about: str, results: Results) -> Table:
-    """Errors on all parts, and whether a method differs from ours."""
-    rows = []
-    for name in ordered(results):
-        cells = [across(results[name], part, "loose") for part in PARTS]
-        p = None if name in (OURS, TWINS) else compared(results[OURS], results[name], "test")
-        rows.append([name, across(results[name], "test", "all"), *cells, p])
-    return Table(
-        "Where the cloth is (SMAD Tables 2, 3, J and K, in millimetres)",
-        about + "Mean distance of nodes to their true places; loose are the "
-        f"{measures.LOOSE:.0%} of the nodes that are furthest from their mean offset in training. Rollouts from rest; "
-        "intervals are a bootstrap over motions; p: two-sided paired t-test against ours over the motions of the test. "
-        f"Nodes that are lost count as {measures.LOST:g} m away.",
-        ["method", "test, all nodes", *(f"{part}, loose" for part in PARTS), "p"],
-        rows,
-    )
-
-
-def swing_table(results: Results) -> Table:
-    """Does it swing as much as it should, and in time?"""
-    rows = [
-        [n, *(across(results[n], "test", what) for what in ("swing", "lag", "acceleration", "spikes"))]
-        for n in ordered(results)
-    ]
-    return Table(
-        "How it swings (SMAD Fig. 6 left)",
-        "Loose nodes on the motions of the test. Swing: speed in the body frame, root mean square, as a share of the "
-        "true one. Lag: milliseconds by which the true motion comes after the method's (skinning's: how late cloth "
-        "follows the body). Acceleration error, mm a frame squared; spikes: share of frames with more of it than three "
-        "deviations above the median of skinning's.",
-        ["method", "swing", "lag, ms", "acceleration error", "spikes"],
-        rows,
-    )
-
-
-def paper_table(results: Results) -> Table:
-    """SMAD Tables 2 and 4: order of the paper's PSNR, and ours of errors."""
-    letters = ("A0", "A1", "A2", "A3", "B0", "B1", "B2", "B3")
-    printed = {f"{key} ": published.SMAD_2.at(key, "PSNR").value for key in letters}
-    rows, known = [], []
-    for name in ordered(results):
-        paper = next((value for key, value in printed.items() if name.startswith(key)), None)
-        if name in ("MLP", "vanilla GNN", OURS):
-            row = published.SMAD if name == OURS else name
-            paper = published.SMAD_4.at((row, "test"), "PSNR").value
-        if paper is None:
-            continue
-        here = mean(results[name], "test", "loose")
-        known.append((paper, -here))
-        rows.append([name, paper, here])
-    pairs = [(a, b) for k, a in enumerate(known) for b in known[:k] if a[0] != b[0]]
-    same = sum((a[0] > b[0]) == (a[1] > b[1]) for a, b in pairs)
-    return Table(
-        "The paper's order",
-        "The paper's PSNR (higher is better) beside our error of loose nodes on the test, mm (lower is better). A4's "
-        "latent codes change the look alone and are not in this comparison.",
-        ["method", "paper, dB", "here, mm"],
-        rows,
-        [f"Of {len(pairs)} pairs, {same} are in the paper's order."],
-    )
-
-
-def long_table(results: Results) -> Table:
-    """SMAD Table 5: errors on long sequences, and whether they grow."""
-    rows = []
-    for name in ordered(results):
-        found = results[name][0]["long"]
-        if found:
-            cells = [x for label in found for x in (found[label]["loose"], estimate(found[label]["growth"]))]
-            rows.append([name, *cells])
-    columns = [x for kind in MOTIONS.long for x in (measures.label(kind), "growth, mm in 1,000 frames")]
-    return Table(
-        "Long sequences (SMAD Table 5)",
-        "960 frames under the keyboard: keys that change (dynamic), one key held (repetitive). Loose nodes, mm; growth "
-        "with its interval over blocks of frames. First seed.",
-        ["method", *columns],
-        rows,
-    )
-
-
-def ordered(results: Results) -> list[str]:
-    """Twins, yardsticks, then what is learned."""
-    first = [name for name in (TWINS, *YARDSTICKS) if name in results]
-    return first + [name for name in results if name not in first]
-
-
-def mean(seeds: list[Found], part: str, what: str) -> float:
-    """The mean over motions and seeds."""
-    return float(np.mean([value for found in seeds for value in found[part][what]]))
-
-
-def across(seeds: list[Found], part: str, what: str) -> Estimate | None:
-    """The mean over seeds of each motion, and its interval over motions."""
-    if not seeds[0].get(part):
-        return None
-    return bootstrap(np.mean([found[part][what] for found in seeds], axis=0))
-
-
-def compared(ours: list[Found], other: list[Found], part: str) -> float:
-    """The p-value of the difference in the errors of loose nodes, motion by motion."""
-    a, b = (np.mean([found[part]["loose"] for found in seeds], axis=0) for seeds in (ours, other))
-    return paired_t_test(a, b).p
-
-
-def estimate(cells: list[float]) -> Estimate:
-    """A mean with its bounds as JSON had it."""
-    value, low, high = cells
-    return Estimate(value, low, high, 1) if math.isfinite(low) else Estimate(value, math.nan, math.nan, 1)
+    made = [table.markdown() for table in smad_dynamics_tables.tables(about, results, MOTIONS)]
+    command = f"python -m experiments.smad_dynamics --avatar {args.avatar} --preset {args.preset}"
+    command += f" --seeds {args.seeds} --motions {' '.join(map(str, args.motions))}"
+    text = "\n".join([*made, f"`{command}` on {made_on}.", ""])
+    smad_dynamics_tables.plots(folder, results[args.motions[0]], MOTIONS)
+    atomic.write_text(folder / "dynamics.md", text)
+    atomic.write_text(folder / "dynamics.json", json.dumps(results, indent=1))
+    print(text, flush=True)
 
 
 def main(argv: list[str] | None = None) -> int:

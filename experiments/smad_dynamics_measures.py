@@ -25,6 +25,7 @@ SETTLE = 15  # frames after the start that no measure counts: a rollout begins a
 LOOSE = 0.3  # the share of nodes that count as loose
 LAGS = 10  # frames up to which a delay is looked for
 LOST = 10.0  # metres from the root beyond which a node is no further off: a rollout that diverged has an error too
+WINDOW = 15  # frames of half a second, in which poses are compared with those that were learned from
 BLOCK = 30  # frames of a long sequence that are averaged, and drawn together for its trend's interval
 
 # Nodes (t, n, 3) in the body frame of every frame of a take; None where nothing is known.
@@ -105,9 +106,10 @@ def one_take(
     truth: Float[np.ndarray, "t n 3"],
     chosen: Int[np.ndarray, " m"],
     threshold: float,
-) -> dict[str, float]:
+) -> dict[str, typing.Any]:
     """Mean distances (mm) of all and of chosen nodes; of the chosen their speed as a share of the true one, how many
-    milliseconds the true motion comes later, the acceleration error (mm a frame squared) and the share of spikes."""
+    milliseconds the true motion comes later, the acceleration error (mm a frame squared), the share of spikes, and the
+    distance in each window of frames."""
     apart = 1000 * np.linalg.norm(nodes - truth, axis=-1)[SETTLE:]
     mine, true = (np.diff(x[SETTLE:, chosen], axis=0) for x in (nodes, truth))
     errors = _jerks(nodes, truth, chosen)
@@ -118,7 +120,35 @@ def one_take(
         "lag": 1000 / 30 * delay(mine, true),
         "acceleration": float(errors.mean()),
         "spikes": float(motion.spikes(errors, threshold).mean()),
+        "windows": _cut(apart[:, chosen].mean(axis=1), WINDOW).mean(axis=1).tolist(),
     }
+
+
+def similarity(
+    config: SmadConfig, system: System, parts: Mapping[str, Mapping[Name, Take]]
+) -> dict[str, list[list[float]]]:
+    """How like the poses of each window of the motions of the test and of unseen ones are to the nearest of those that
+    were learned from, whenever they begin there."""
+    features = {
+        part: [np.asarray(dynamics.pose_features(config, system, take.poses)) for take in takes.values()]
+        for part, takes in parts.items()
+    }
+    known = np.concatenate([_shifted(x) for x in features["train"]])
+
+    def one(x):
+        return motion.nearest_correlation(_cut(x[SETTLE:], WINDOW).reshape(-1, known.shape[1]), known).tolist()
+
+    return {part: [one(x) for x in features[part]] for part in ("test", "unseen")}
+
+
+def _shifted(features: Float[np.ndarray, "t p"]) -> Float[np.ndarray, "k wp"]:
+    """All windows, from every frame on."""
+    return np.stack([features[k : k + WINDOW].reshape(-1) for k in range(len(features) - WINDOW + 1)])
+
+
+def _cut(values: np.ndarray, frames: int) -> np.ndarray:
+    """Whole pieces (k, frames, ...) of so many frames, one after the other."""
+    return values[: len(values) // frames * frames].reshape(-1, frames, *values.shape[1:])
 
 
 def delay(mine: Float[np.ndarray, "t n 3"], true: Float[np.ndarray, "t n 3"], most: int = LAGS) -> float:
@@ -146,7 +176,7 @@ def long_errors(
     error over time, a value a block of frames."""
     errors = 1000 * np.linalg.norm(nodes - truth, axis=-1)[SETTLE:, chosen].mean(axis=1)
     line = drift.trend(errors, block=BLOCK)
-    blocks = errors[: len(errors) // BLOCK * BLOCK].reshape(-1, BLOCK).mean(axis=1)
+    blocks = _cut(errors, BLOCK).mean(axis=1)
     growth = [1000 * float(x) for x in (line.slope, *line.slope_interval)]
     return {"loose": float(errors.mean()), "growth": growth, "curve": blocks.tolist()}
 

@@ -17,6 +17,7 @@ from avatarjax.smad.train_dynamics import Take
 from avatarjax.train import StageConfig
 from experiments import smad_dynamics as experiment
 from experiments import smad_dynamics_measures as measures
+from experiments import smad_dynamics_tables as tables
 from experiments import smad_motions
 from experiments.smad_motions import Motions
 
@@ -74,6 +75,41 @@ def test_errors_that_grow_are_told():
     assert len(found["curve"]) == 9
 
 
+def fabricated(loose, likeness=(0.9, 0.5), windows=(10.0, 20.0), seconds=3.0):
+    """What is found of a method on one motion of each part."""
+    part = {"loose": [loose], "windows": [list(windows)]}
+    similarity = {"test": [list(likeness)], "unseen": [list(likeness)]}
+    return [{"train": part, "test": part, "unseen": part, "seconds": seconds, "similarity": similarity}]
+
+
+def test_weights_are_in_order_and_the_presets_last():
+    results = {"ours": fabricated(5.0), "isometry 1": fabricated(9.0), "isometry 0.01": fabricated(4.0)}
+    made = tables.weights_table(results, tables.ISOMETRY)
+    assert [row[0] for row in made.rows] == [0.01, 1.0, "the preset's"]
+    assert [row[2].mean for row in made.rows] == [4.0, 9.0, 5.0]
+
+
+def test_lengths_of_training_are_in_order_after_what_needs_none():
+    results = {"ours": fabricated(5.0), "ridge regression": fabricated(7.0)}
+    results |= {f"{n:g}{tables.LENGTH}": fabricated(4.0, seconds=n) for n in (9.0, 0.1)}
+    made = tables.length_table(results)
+    assert [row[:2] for row in made.rows] == [
+        ["ridge regression", 0.0],
+        ["0.1 times the steps", 0.1],
+        ["ours", 3.0],
+        ["9 times the steps", 9.0],
+    ]
+
+
+@pytest.mark.parametrize(("ours", "verdict"), [((10.0, 11.0), ": reproduced"), ((10.0, 30.0), "not reproduced")])
+def test_whether_errors_stay_as_they_are_far_from_training_is_said(ours, verdict):
+    results = {name: fabricated(1.0) for name in ("skinning", "ridge regression")}
+    results["ours"] = fabricated(1.0, windows=ours)
+    made = tables.similarity_table(results)
+    assert verdict in made.remarks[0] and "skinning" in made.remarks[0]
+    assert made.rows[0][0] == "0.50 to 0.50" and made.rows[-1][0] == "0.90 to 0.90"
+
+
 def tiny():
     net = dataclasses.replace(CI.deformer, hidden=16, message=8, decoder=(16, 8), pose_width=16, pose_embedding=8)
     return dataclasses.replace(
@@ -108,17 +144,17 @@ def test_all_methods_and_yardsticks_are_measured(finished):
     folder, _ = finished
     both = json.loads((folder / "dynamics.json").read_text())
     found, less = both["2"], both["1"]
-    assert set(less) == {experiment.TWINS, *experiment.YARDSTICKS, "ours"}
+    assert set(less) == {tables.TWINS, *tables.YARDSTICKS, "ours"}
     assert found["mean drape"][0]["test"]["loose"] != less["mean drape"][0]["test"]["loose"]
-    assert set(found) == {experiment.TWINS, *experiment.YARDSTICKS, "ours", "A0 base"}
+    assert set(found) == {tables.TWINS, *tables.YARDSTICKS, "ours", "A0 base"}
     errors = {name: np.mean(seeds[0]["test"]["loose"]) for name, seeds in found.items()}
     assert 0 < errors["twins"] < errors["skinning"]
     # Only the tests have twins.
     assert not found["twins"][0]["unseen"]
     page = (folder / "dynamics.md").read_text()
-    for text in ("| mean drape |", "pairs", "run-0", "A0 base", "lag, ms", "How much motion"):
+    for text in ("| mean drape |", "pairs", "run-0", "A0 base", "lag, ms", "How much motion", "Fig. J"):
         assert text in page
-    for name in ("motions2/nodes.png", "long-run-0.png"):
+    for name in ("motions2/nodes.png", "long-run-0.png", "similarity.png"):
         assert (folder / name).stat().st_size > 1000
 
 

@@ -75,3 +75,26 @@ def test_what_is_not_finite_is_refused(joints):
         motion.spike_threshold(np.array([np.nan, 1.0]))
     with pytest.raises(ValueError, match="threshold must be finite"):
         motion.spikes(np.ones(3), float("nan"))
+
+
+def test_a_known_window_is_fully_like_itself_whatever_its_size():
+    known = np.random.default_rng(1).normal(size=(20, 12)) + 5
+    mean = known.mean(0)
+    windows = mean + np.array([[1.0], [0.3], [4.0]]) * (known[[2, 7, 11]] - mean)
+    np.testing.assert_allclose(motion.nearest_correlation(windows, known), 1.0)
+
+
+def test_likeness_is_the_highest_correlation():
+    rng = np.random.default_rng(2)
+    known, windows = rng.normal(size=(30, 8)), rng.normal(size=(4, 8))
+    about = known.mean(0)
+    cosines = [
+        [np.dot(w - about, k - about) / np.linalg.norm(w - about) / np.linalg.norm(k - about) for k in known]
+        for w in windows
+    ]
+    np.testing.assert_allclose(motion.nearest_correlation(windows, known), np.max(cosines, axis=1))
+
+
+def test_the_mean_is_like_nothing():
+    known = np.random.default_rng(3).normal(size=(5, 3))
+    assert motion.nearest_correlation(known.mean(0)[None], known)[0] == pytest.approx(0, abs=1e-12)

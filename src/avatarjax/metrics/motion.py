@@ -65,6 +65,24 @@ def spikes(errors: Float[np.ndarray, " t"], threshold: float) -> Bool[np.ndarray
     return checks.finite("errors", errors, (None,)) > threshold
 
 
+def nearest_correlation(windows: Float[np.ndarray, "w d"], known: Float[np.ndarray, "k d"]) -> Float[np.ndarray, " w"]:
+    """The highest normalised cross-correlation, -1 to 1, of each window of poses with any known one (SMAD D.4, Fig. J).
+
+    A window is a stretch of poses as one vector; give every place at which a known one may begin, and the correlation
+    is the highest over shifts in time too. Both are taken about the mean of the known ones; a window that is that mean
+    is like none, 0. Raises ValueError for lengths that differ, and numbers that are not finite.
+    """
+    known = checks.finite("known", known, (None, None))
+    windows = checks.finite("windows", windows, (None, known.shape[1]))
+    mean = known.mean(axis=0)
+
+    def unit(values):
+        centred = values - mean
+        return centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+
+    return (unit(windows) @ unit(known).T).max(axis=1)
+
+
 def _difference(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Second differences (f - 2, j, 3) of the error: differences are linear."""
     truth = checks.finite("truth", truth, (None, None, 3))
