@@ -39,6 +39,7 @@ from experiments.smad_dynamics_measures import Found, Method
 from experiments.smad_dynamics_tables import (
     DAMPING,
     ISOMETRY,
+    KERNEL,
     LENGTH,
     MEAN,
     OURS,
@@ -221,6 +222,7 @@ def yardsticks(config: SmadConfig, params: typing.Any, system: System, recorded:
     }
     methods = {label: measures.of_linear(config, model, system) for label, model in models.items()}
     return methods | {
+        KERNEL: measures.of_drape(config, system),
         SKINNING: measures.of_skinning(system),
         POSES: measures.of_equilibrium(config, params, system),
     }

@@ -112,7 +112,7 @@ def test_a_file_that_is_none_is_refused(avatar, tmp_path):
         files.load("nobody", runs=tmp_path)
     path = tmp_path / "avatar.safetensors"
     weights.save_tree(path, {"a": np.zeros(1)})
-    with pytest.raises(ValueError, match="no SMAD avatar of version 2"):
+    with pytest.raises(ValueError, match="no SMAD avatar of version 3"):
         files.load(path)
     files.save(path, avatar)
     arrays, metadata = weights.load_arrays(path)

@@ -9,7 +9,7 @@ import pytest
 
 from avatarjax import rotations
 from avatarjax.smad import config as configs
-from avatarjax.smad import driving, dynamics, graph, linear, train_dynamics
+from avatarjax.smad import drape, driving, dynamics, graph, train_dynamics
 from avatarjax.smad.config import DynamicsConfig
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.train_dynamics import Take
@@ -91,7 +91,7 @@ def test_the_equilibrium_departs_from_the_drape(system, takes):
     params, frame = dynamics.init(CONFIG, system, jax.random.key(0)), jnp.asarray(40)
     state = train_dynamics.calm_at(CONFIG, params, system, recorded, frame)
     window = train_dynamics.window_at(CONFIG, recorded, frame)[:: CONFIG.deformer.pose_stride]
-    np.testing.assert_allclose(state.offset, linear.offsets(system.drape, window), atol=1e-6)
+    np.testing.assert_allclose(state.offset, drape.offsets(system.drape, window), atol=1e-6)
     assert np.abs(state.offset - recorded.offsets[40]).mean() < 0.5 * np.abs(recorded.offsets[40]).mean()
     without = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, components=0))
     assert train_dynamics.fit_system(without, system.graph, None, takes).drape is None

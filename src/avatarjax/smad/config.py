@@ -101,8 +101,8 @@ class DynamicsConfig:
     """How the dynamics are learned from tracks; from those of videos the equilibrium alone, and the rest from pictures
     (`PicturesConfig`). All is ours.
 
-    components: of the offsets, whose ridge regression from the pose window (with so much `ridge`) is the drape that the
-    equilibrium departs from; 0: none.
+    components: of the offsets, whose kernel ridge regression from the pose window (with so much `ridge` and so many
+    `centres`, `drape.fit`) is the drape that the equilibrium departs from; 0: none.
     target_stage: of what poses alone say of the offsets, which needs no rollouts, in frames; stage: of all else, in
     rollouts of so many `frames`. noise: of the offsets from which rollouts start, in units of the
     offsets' spread, constant over the history. isometry, damping: weights of Eq. 11, means over edges and nodes.
@@ -112,7 +112,8 @@ class DynamicsConfig:
     """
 
     components: int = 48
-    ridge: float = 0.02
+    ridge: float = 0.1
+    centres: int = 1_000
     frames: int = 12
     noise: float = 0.05
     isometry: float = 0.001

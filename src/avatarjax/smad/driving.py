@@ -12,7 +12,8 @@ import typing
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from avatarjax import rotations
 from avatarjax.data.recording import Poses
@@ -86,3 +87,13 @@ def track(poses: Pose, dt: float) -> Float[Array, "t f"]:
     """`features` of every frame of a motion (t poses); before the first the body is taken to have been at rest."""
     before = jax.tree.map(lambda x: jnp.concatenate([x[:1], x[:-1]]), poses)
     return jax.vmap(features, in_axes=(0, 0, None))(before, poses, dt)
+
+
+def windows(
+    features: Float[np.ndarray, "f p"], first: Int[np.ndarray, " f"], count: int, stride: int
+) -> Float[np.ndarray, "f w p"]:
+    """The window of so many poses, `stride` frames apart and newest first, that ends in each of f frames of takes one
+    after the other; before the first frame of a take, which is given for each, the body is taken to have stood still.
+    """
+    back = np.arange(len(features))[:, None] - stride * np.arange(count)
+    return features[np.maximum(back, first[:, None])]

@@ -28,11 +28,11 @@ from jaxtyping import Array, Float, Key
 from avatarjax.nets.functional import Params
 from avatarjax.physics import mass_spring_damper as msd
 from avatarjax.physics.mass_spring_damper import Springs
-from avatarjax.smad import deformer, driving, linear, skeletal
+from avatarjax.smad import deformer, drape, driving, skeletal
 from avatarjax.smad.config import SmadConfig
+from avatarjax.smad.drape import Drape
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.graph import Graph
-from avatarjax.smad.linear import Linear
 from avatarjax.smad.skeletal import Skin
 
 # Numbers of a node beside its place and velocities: at rest, offset, swing, the surface's motion.
@@ -60,8 +60,8 @@ class Scaling:
 @typing.no_type_check
 @flax.struct.dataclass
 class System:
-    """What dynamics are learned for: the graph, what drives its nodes, scaling, and the drape that a window of poses
-    says linearly, from which the learned equilibrium departs (none: from no offset).
+    """What dynamics are learned for: the graph, what drives its nodes, scaling, and the drape of a window of poses in
+    closed form, from which the learned equilibrium departs (none: from no offset).
 
     Without a skin (its joints are not known) the nodes' places at rest are the driven surface.
     """
@@ -69,7 +69,7 @@ class System:
     graph: Graph
     skin: Skin | None
     scaling: Scaling
-    drape: Linear | None = None
+    drape: Drape | None = None
 
 
 @typing.no_type_check
@@ -148,7 +148,7 @@ def settled(config: SmadConfig, params: Params, system: System, window: Float[Ar
         return jnp.zeros(params["target"].shape[1:])
     window = window[:: config.deformer.pose_stride]
     learned = jnp.tensordot(deformer.embed(config.deformer, params["deformer"], window), params["target"], 1)
-    return learned if system.drape is None else learned + linear.offsets(system.drape, window)
+    return learned if system.drape is None else learned + drape.offsets(system.drape, window)
 
 
 @functools.partial(jax.jit, static_argnames="config")

@@ -14,13 +14,13 @@ from avatarjax.gaussians import Gaussians
 from avatarjax.io import weights
 from avatarjax.smad.avatar import Avatar
 from avatarjax.smad.config import PRESETS, SmadConfig
+from avatarjax.smad.drape import Drape
 from avatarjax.smad.dynamics import Scaling, System
 from avatarjax.smad.embedded import Binding
 from avatarjax.smad.graph import Graph
-from avatarjax.smad.linear import Linear
 from avatarjax.smad.skeletal import Skin
 
-VERSION = 2
+VERSION = 3
 FILE = "avatar.safetensors"
 
 
@@ -66,9 +66,7 @@ def _read(path: Path) -> Avatar:
         if metadata["skeleton"] is not None:
             names, parents = (tuple(metadata["skeleton"][part]) for part in ("names", "parents"))
             skin = Skin(Rig(**system["skin"]["rig"], names=names, parents=parents), system["skin"]["basis"])
-        drape, net = system.get("drape"), config.deformer
-        if drape is not None:
-            drape = Linear(**drape, window=net.pose_window, stride=net.pose_stride, lags=0)
+        drape = Drape(**system["drape"]) if "drape" in system else None
         return Avatar(
             gaussians=Gaussians(**tree["gaussians"]),
             binding=Binding(**tree["binding"]),

@@ -1,4 +1,4 @@
-"""Linear models of how nodes lie: yardsticks, and what the learned equilibrium starts from.
+"""Linear models of how nodes lie: yardsticks.
 
 A learned deformer that does not beat them has not worked yet. With c the principal components of the nodes' offsets
 from the driven surface in training, x_t a window of pose features and W from ridge regression:
@@ -17,6 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from avatarjax.smad import driving
 
 # How much further than in training a component may go.
 REACH = 1.5
@@ -56,28 +58,22 @@ def fit(
     components: no more than there are coordinates. ridge: of the squared weights against a frame's squared error, pose
     features and components being of unit size. Raises ValueError for fewer frames than components.
     """
-    count = len(offsets)
-    if count < components:
-        raise ValueError(f"{components} components need as many frames, there are {count}")
-    places = np.asarray(offsets, np.float64)
-    mean = places.mean(axis=0)
-    flat = (places - mean).reshape(count, -1)
-    basis = np.linalg.svd(flat, full_matrices=False)[2][:components]
-    wanted = flat @ basis.T
+    mean, basis, wanted = principal(offsets, components)
+    count = len(wanted)
     unit = 1 / max(float(np.sqrt(np.mean(wanted**2))), 1e-9) if len(basis) else 1.0
     starts = np.asarray(first)
+    poses = driving.windows(np.asarray(features, np.float64), starts, window, stride)
 
     def earlier(frames: int) -> np.ndarray:
         return np.maximum(np.arange(count) - frames, starts)
 
-    poses = np.asarray(features, np.float64)
-    inputs = [poses[earlier(stride * k)] for k in range(window)]
+    inputs = [poses.reshape(count, -1)]
     inputs += [unit * wanted[earlier(k)] for k in range(1, lags + 1)]
     x = np.concatenate([*inputs, np.ones((count, 1))], axis=1)
     weights = np.linalg.solve(x.T @ x + ridge * count * np.eye(x.shape[1]), x.T @ wanted)
     return Linear(
         jnp.asarray(mean, jnp.float32),
-        jnp.asarray(basis.reshape(-1, *mean.shape), jnp.float32),
+        jnp.asarray(basis, jnp.float32),
         jnp.asarray(np.abs(wanted).max(axis=0), jnp.float32),
         jnp.asarray(unit, jnp.float32),
         jnp.asarray(weights, jnp.float32),
@@ -85,6 +81,20 @@ def fit(
         stride,
         lags,
     )
+
+
+def principal(
+    offsets: Float[Array | np.ndarray, "f n 3"], components: int
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "c n 3"], Float[np.ndarray, "f c"]]:
+    """The mean of offsets, their first principal components, and every frame in these. Raises ValueError for fewer
+    frames than components."""
+    if len(offsets) < components:
+        raise ValueError(f"{components} components need as many frames, there are {len(offsets)}")
+    places = np.asarray(offsets, np.float64)
+    mean = places.mean(axis=0)
+    flat = (places - mean).reshape(len(places), -1)
+    basis = np.linalg.svd(flat, full_matrices=False)[2][:components]
+    return mean, basis.reshape(-1, *mean.shape), flat @ basis.T
 
 
 def rollout(linear: Linear, features: Float[Array, "t p"]) -> Float[Array, "t n 3"]:
@@ -99,11 +109,6 @@ def rollout(linear: Linear, features: Float[Array, "t p"]) -> Float[Array, "t n 
 
     found = jax.lax.scan(advance, jnp.zeros((linear.lags, len(linear.basis))), windows)[1]
     return linear.mean[None] + jnp.tensordot(found, linear.basis, 1)
-
-
-def offsets(linear: Linear, window: Float[Array, "w p"]) -> Float[Array, "n 3"]:
-    """The offsets under one window of poses, newest first, metres; of a model without lags."""
-    return linear.mean + jnp.tensordot(predict(linear, window, jnp.zeros((0, len(linear.basis)))), linear.basis, 1)
 
 
 def predict(linear: Linear, window: Float[Array, "w p"], before: Float[Array, "l c"]) -> Float[Array, "c"]:

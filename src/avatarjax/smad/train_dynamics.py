@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from avatarjax.nets.functional import Params
-from avatarjax.smad import driving, dynamics, linear
+from avatarjax.smad import drape, driving, dynamics
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.deformer import Deltas
 from avatarjax.smad.driving import Pose
@@ -85,14 +85,15 @@ def fit_system(config: SmadConfig, graph: Graph, skin: Skin | None, takes: Seque
     if not (config.equilibrium and settings.components):
         return system
     whole = record(config, system, takes)
-    drape = linear.fit(
+    fitted = drape.fit(
         *(whole.offsets, whole.features, whole.first),
         components=min(settings.components, len(whole.first)),
         window=config.deformer.pose_window,
         stride=config.deformer.pose_stride,
         ridge=settings.ridge,
+        centres=settings.centres,
     )
-    return system.replace(drape=drape)
+    return system.replace(drape=fitted)
 
 
 def record(config: SmadConfig, system: System, takes: Sequence[Take]) -> Recorded:
