@@ -209,7 +209,7 @@ def similarity_table(results: Results) -> Table:
     near, errors, motion = windows(results, methods)
     bins = quarters(near)
     rows = [
-        [f"{near[b].min():.2f} to {near[b].max():.2f}", *(bootstrap(errors[name][b], motion[b]) for name in methods)]
+        [f"{near[b].min():.3f} to {near[b].max():.3f}", *(bootstrap(errors[name][b], motion[b]) for name in methods)]
         for b in bins
     ]
     growth = {name: errors[name][bins[0]].mean() / errors[name][bins[-1]].mean() - 1 for name in methods}

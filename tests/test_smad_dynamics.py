@@ -107,7 +107,7 @@ def test_whether_errors_stay_as_they_are_far_from_training_is_said(ours, verdict
     results["ours"] = fabricated(1.0, windows=ours)
     made = tables.similarity_table(results)
     assert verdict in made.remarks[0] and "skinning" in made.remarks[0]
-    assert made.rows[0][0] == "0.50 to 0.50" and made.rows[-1][0] == "0.90 to 0.90"
+    assert made.rows[0][0] == "0.500 to 0.500" and made.rows[-1][0] == "0.900 to 0.900"
 
 
 def tiny():
