@@ -58,4 +58,5 @@ def euler(network: Network, noise: Float[Array, "b d"], sigmas: Float[Array, "st
         clean = denoise(network, x, jnp.full(x.shape[0], sigma))
         return clean + (x - clean) * (sigma_next / sigma), None
 
-    return jax.lax.scan(step, noise * sigmas[0], (sigmas[:-1], sigmas[1:]))[0]
+    # Few steps are written out: inside a loop XLA uses a single core of a CPU.
+    return jax.lax.scan(step, noise * sigmas[0], (sigmas[:-1], sigmas[1:]), unroll=len(sigmas) <= 5)[0]
