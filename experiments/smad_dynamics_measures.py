@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from avatarjax.metrics import drift, motion
 from avatarjax.nets.functional import Params
-from avatarjax.smad import drape, driving, dynamics, linear
+from avatarjax.smad import dynamics, linear
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.dynamics import System
 from avatarjax.smad.linear import Linear
@@ -64,19 +64,6 @@ def of_linear(config: SmadConfig, model: Linear, system: System) -> Method:
         return dynamics.surfaces(system, poses) + linear.rollout(model, features)
 
     return lambda _, take: np.asarray(roll(model, system, take.poses))
-
-
-def of_drape(config: SmadConfig, system: System) -> Method:
-    """The drape alone, which the learned equilibrium departs from."""
-    net = config.deformer
-
-    def lie(_, take):
-        features = np.asarray(dynamics.pose_features(config, system, take.poses))
-        windows = driving.windows(features, np.zeros(len(features), int), net.pose_window, net.pose_stride)
-        offsets = jax.lax.map(lambda window: drape.offsets(system.drape, window), jnp.asarray(windows))
-        return np.asarray(dynamics.surfaces(system, take.poses) + offsets)
-
-    return lie
 
 
 def of_skinning(system: System) -> Method:
