@@ -7,8 +7,10 @@ from pathlib import Path
 
 import jaxtyping
 
-# Most of a run is compiling, a quarter of it by the emitters of fused loops, whose faster code most tests run but once.
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
+# Most of a run is compiling, and most tests run what they compile but once: without the emitters of fused loops a
+# quarter of it is saved, and with little optimisation another sixth.
+_quick = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_quick}".strip()
 
 # Before anything imports avatarjax: check the shape annotations of every function of the package with beartype.
 _hook = jaxtyping.install_import_hook("avatarjax", "beartype.beartype")

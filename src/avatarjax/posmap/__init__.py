@@ -12,7 +12,7 @@ from avatarjax.posmap.codec import (
     root,
     to_map,
 )
-from avatarjax.posmap.neighbours import around, neighbours
+from avatarjax.posmap.neighbours import around, convolve, neighbours
 from avatarjax.posmap.surface import Frames, Tangents, frames, tangents, turns
 from avatarjax.posmap.upscale import Upscaler, build_upscaler, upscale
 
@@ -27,6 +27,7 @@ __all__ = [
     "bounding_box",
     "build_atlas",
     "build_upscaler",
+    "convolve",
     "denormalize",
     "encode",
     "frames",

@@ -12,23 +12,18 @@ from jaxtyping import Array, Float, Int
 from avatarjax.posmap.atlas import Atlas
 from avatarjax.posmap.neighbours import STEPS, around, neighbours
 
-# The quarters of a texel, upper left to lower right, and the four texels, itself first, between which each lies.
-_QUARTERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
-_CORNERS = np.array([[STEPS.index(s) for s in ((0, 0), (dy, 0), (0, dx), (dy, dx))] for dy, dx in _QUARTERS])
-
 
 @typing.no_type_check
 @flax.struct.dataclass
 class Upscaler:
     """A fixed linear map from t texels to n = t factor^2 finer ones, those of one texel side by side.
 
-    neighbours (t, 9) as `posmap.neighbours`; weights (t, 4, p, 4) of the four texels around each of the p fine texels
-    in each quarter, with sum 1 over those that are foreground; rows, cols (n,) the place in the fine map of side
-    `size`.
+    neighbours (t, 9) as `posmap.neighbours`; weights (t, p, 9) of them for each of the p = factor^2 fine texels, with
+    sum 1, of which at most four are not 0; rows, cols (n,) the place in the fine map of side `size`.
     """
 
     neighbours: Int[Array, "t 9"]
-    weights: Float[Array, "t 4 p 4"]
+    weights: Float[Array, "t p 9"]
     rows: Int[Array, "n"]
     cols: Int[Array, "n"]
     size: int = flax.struct.field(pytree_node=False)
@@ -44,19 +39,15 @@ def build_upscaler(atlas: Atlas, size: int) -> Upscaler:
     if size % atlas.size or factor % 2:
         raise ValueError(f"upscaled side {size} must be an even multiple of the map's side {atlas.size}")
     around_each = neighbours(atlas)
-    half = np.arange(factor // 2)
-    inside, weights = [], []
-    for dy, dx in _QUARTERS:
-        i, j = (x.ravel() for x in np.meshgrid(half + (dy > 0) * half.size, half + (dx > 0) * half.size, indexing="ij"))
-        # How far, in coarse texels, a fine texel's centre is from that of its coarse one, towards the quarter's corner.
-        y, x = np.abs((i + 0.5) / factor - 0.5), np.abs((j + 0.5) / factor - 0.5)
-        inside.append(np.stack([i, j], axis=1))
-        weights.append(np.stack([(1 - y) * (1 - x), y * (1 - x), (1 - y) * x, y * x], axis=1))
-    there = (around_each < len(around_each))[:, _CORNERS]
-    share = np.stack(weights)[None] * there[:, :, None]
-    inside = np.concatenate(inside)[None]
-    rows = np.asarray(atlas.rows)[:, None] * factor + inside[..., 0]
-    cols = np.asarray(atlas.cols)[:, None] * factor + inside[..., 1]
+    # Quarter by quarter: the order in which files have what belongs to fine texels.
+    below, right, row, col = np.indices((2, 2, factor // 2, factor // 2)).reshape(4, -1)
+    inside = np.stack([below * (factor // 2) + row, right * (factor // 2) + col], axis=1)
+    # From neighbours' centres to a fine texel's, of which the share falls linearly to 0 at a texel's distance.
+    away = np.abs(((inside + 0.5) / factor - 0.5)[:, None] - np.array(STEPS)[None])
+    weights = np.maximum(1 - away, 0).prod(axis=-1)
+    share = weights[None] * (around_each < len(around_each))[:, None]
+    rows = np.asarray(atlas.rows)[:, None] * factor + inside[None, :, 0]
+    cols = np.asarray(atlas.cols)[:, None] * factor + inside[None, :, 1]
     return Upscaler(
         neighbours=jnp.asarray(around_each),
         weights=jnp.asarray(share / share.sum(-1, keepdims=True), jnp.float32),
@@ -68,5 +59,5 @@ def build_upscaler(atlas: Atlas, size: int) -> Upscaler:
 
 def upscale(upscaler: Upscaler, texels: Float[Array, "t d"]) -> Float[Array, "n d"]:
     """Values of the fine texels, those of one texel side by side: a fine map is `empty.at[rows, cols].set(values)`."""
-    corners = around(upscaler.neighbours, texels)[:, _CORNERS]
-    return jnp.einsum("tqpk,tqkd->tqpd", upscaler.weights, corners).reshape(-1, texels.shape[-1])
+    fine = jnp.einsum("tpk,tkd->tpd", upscaler.weights, around(upscaler.neighbours, texels))
+    return fine.reshape(-1, texels.shape[-1])

@@ -54,7 +54,8 @@ class TexelHead(nnx.Module):
     def __call__(self, features: Float[Array, "t f"], neighbours: Int[Array, "t 9"]) -> Float[Array, "t 10"]:
         x = features
         for layer in self.layers:
-            x = jax.nn.silu(layer(posmap.around(neighbours, x).reshape(len(x), -1)))
+            kernel = layer.kernel[...].reshape(9, x.shape[1], -1)
+            x = jax.nn.silu(posmap.convolve(neighbours, x, kernel) + layer.bias[...][None])
         return self.leave(x)
 
 
