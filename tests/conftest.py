@@ -5,6 +5,7 @@ import os
 import tempfile
 from pathlib import Path
 
+import filelock
 import jaxtyping
 
 # Most of a run is compiling, and most tests run what they compile but once: without the emitters of fused loops a
@@ -74,13 +75,15 @@ def tiny_spec():
 
 
 @pytest.fixture(scope="session")
-def tiny_folder(tiny_spec, tmp_path_factory):
-    """The folder of the tiny dataset, built once: read only."""
-    from avatarjax.data import building
+def tiny_folder(tiny_spec):
+    """The folder of the tiny dataset, built once in a run, by the process that needs it first: read only."""
+    from avatarjax.data import building, dataset
 
-    folder = tmp_path_factory.mktemp("tiny") / "data"
-    building.build(folder, tiny_spec, progress=False)
-    return folder
+    shared = Path(os.environ["AVATARJAX_TEST_CACHE"])
+    with filelock.FileLock(shared / "tiny.lock"):
+        if not dataset.matches(shared / "tiny", tiny_spec):
+            building.build(shared / "tiny", tiny_spec, progress=False)
+    return shared / "tiny"
 
 
 @pytest.fixture(scope="session")

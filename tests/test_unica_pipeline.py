@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -15,39 +16,33 @@ from experiments import unica as experiment
 from experiments.tables import __main__ as tables
 from experiments.tables import figures, quality
 from experiments.tables.finished import Finished
+from tests.unica.conftest import TINY
 
-CI = configs.preset("ci")
-SCRIPT = (1,) * 8 + (2,) * 8 + (0,) * 4
+SCRIPT = (1,) * 10 + (2,) * 10
+FEW = StageConfig(3, 2, 1e-3)
 
 
 def tiny():
-    few = StageConfig(3, 2, 1e-3)
+    """Every stage, in a few steps of the smallest networks, on the dataset that other tests have as well."""
     return dataclasses.replace(
-        CI,
+        TINY,
         pca_components=24,
-        upscaled=64,
-        data=configs.DataConfig(
-            transition_frames=105,
-            held_out_frames=60,
-            image_poses=2,
-            image_views=2,
-            standing_views=4,
-            image_size=32,
-            cloth_steps=6,
-        ),
-        views_per_step=2,
-        vae_stage=few,
-        unet_stage=few,
-        coefficients_stage=dataclasses.replace(few, ema=0.9, batch=8),
-        base_stage=few,
-        appearance_stage=few,
-        texels_stage=few,
+        train_both=True,
+        data=dataclasses.replace(TINY.data, cloth_steps=4, vertices="float16"),
+        lpips_network="alex",
+        vae_stage=FEW,
+        unet_stage=FEW,
+        coefficients_stage=dataclasses.replace(FEW, ema=0.9, batch=8),
+        base_stage=FEW,
+        appearance_stage=FEW,
+        texels_stage=FEW,
     )
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(tiny_folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs")
+    shutil.copytree(tiny_folder, out / "unica" / "cowgirl" / "ci" / "data")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(configs.PRESETS, "ci", tiny)
         patch.setattr(experiment, "SCRIPT", SCRIPT)

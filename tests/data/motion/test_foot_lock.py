@@ -34,7 +34,7 @@ def variants(rig):
     """A run that stops, locked and loose, and the same run that turns instead."""
     looping, key = clips.load_clips(rig), jax.random.key(4)
     loose = locomotion.LocomotionConfig(foot_lock=False)
-    stop, turn = (jnp.array([1] * 40 + [action] * 40) for action in (0, 2))
+    stop, turn = (jnp.array([1] * 40 + [action] * 50) for action in (0, 2))
     return {
         "stop": locomotion.simulate(rig, looping, stop, key),
         "turn": locomotion.simulate(rig, looping, turn, key),

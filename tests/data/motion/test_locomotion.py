@@ -21,13 +21,31 @@ def runner():
 
 
 @pytest.fixture(scope="module")
+def play(runner):
+    """The motion of a script of keys, the last of which is held on: all of one length, which compiles once."""
+
+    def play(script, key):
+        held = script + script[-1:] * (BEFORE + AFTER - len(script))
+        motion = locomotion.simulate(*runner, jnp.array(held), key)
+        return jax.tree.map(lambda x: x[: len(script)], motion)
+
+    return play
+
+
+PAIRS = [(a, b) for a in range(5) for b in range(5) if a != b]
+KEYS = jax.random.split(jax.random.key(0), len(PAIRS))
+
+
+def script(pair):
+    return [pair[0]] * BEFORE + [pair[1]] * AFTER
+
+
+@pytest.fixture(scope="module")
 def transitions(runner):
     """One motion of every ordered pair of different actions."""
-    pairs = [(a, b) for a in range(5) for b in range(5) if a != b]
-    actions = jnp.array([[a] * BEFORE + [b] * AFTER for a, b in pairs])
-    keys = jax.random.split(jax.random.key(0), len(pairs))
-    motions = jax.vmap(lambda a, k: locomotion.simulate(*runner, a, k))(actions, keys)
-    return {pair: jax.tree.map(lambda x, i=i: x[i], motions) for i, pair in enumerate(pairs)}
+    actions = jnp.array([script(pair) for pair in PAIRS])
+    motions = jax.vmap(lambda a, k: locomotion.simulate(*runner, a, k))(actions, KEYS)
+    return {pair: jax.tree.map(lambda x, i=i: x[i], motions) for i, pair in enumerate(PAIRS)}
 
 
 @pytest.mark.parametrize("action", DIRECTIONS)
@@ -46,10 +64,9 @@ def test_turns_take_twelve_frames_for_a_half_and_nine_for_a_quarter(transitions,
     assert abs(frames - (12 if half else 9)) <= 1
 
 
-def test_half_a_turn_always_goes_the_same_way(runner):
-    actions = jnp.array([1] * 7 + [2] * 60 + [1] * 60)
-    headings = locomotion.simulate(*runner, actions, jax.random.key(1)).headings
-    assert headings[66] == pytest.approx(np.pi, abs=0.02)
+def test_half_a_turn_always_goes_the_same_way(play):
+    headings = play([1] * 7 + [2] * 40 + [1] * 43, jax.random.key(1)).headings
+    assert headings[46] == pytest.approx(np.pi, abs=0.02)
     assert headings[-1] == pytest.approx(2 * np.pi, abs=0.02)
 
 
@@ -60,34 +77,29 @@ def test_letting_go_of_the_key_stops_the_runner(transitions):
         assert motion.speeds[-1] == pytest.approx(0, abs=1e-2)
 
 
-def test_an_action_drives_its_frame_to_the_next(runner):
-    actions = jnp.array([0] * 20).at[10].set(1)
-    motion = locomotion.simulate(*runner, actions, jax.random.key(2))
+def test_an_action_drives_its_frame_to_the_next(play):
+    motion = play([0] * 10 + [1] + [0] * 9, jax.random.key(2))
     assert motion.speeds[10] == 0 and motion.speeds[11] > 0
     np.testing.assert_array_equal(motion.roots[10], motion.roots[0])
     assert motion.roots[11, 2] > 0
 
 
-def test_a_held_first_key_starts_at_full_speed(runner):
-    motion = locomotion.simulate(*runner, jnp.array([1] * 20), jax.random.key(2))
+def test_a_held_first_key_starts_at_full_speed(runner, play):
+    motion = play([1] * 20, jax.random.key(2))
     np.testing.assert_allclose(motion.speeds, float(runner[1].run_speed), rtol=1e-5)
 
 
-def test_one_key_gives_one_motion_and_another_key_another(runner):
-    actions = jnp.array([1] * 20)
-    first, again, other = (locomotion.simulate(*runner, actions, jax.random.key(k)) for k in (5, 5, 6))
+def test_one_key_gives_one_motion_and_another_key_another(play):
+    first, again, other = (play([1] * 20, jax.random.key(k)) for k in (5, 5, 6))
     np.testing.assert_array_equal(first.transforms, again.transforms)
     assert np.abs(np.asarray(first.local_quats - other.local_quats)).max() > 0.05
 
 
-def test_vmap_equals_the_loop(runner):
-    actions = jnp.array([[0] * 10 + [1] * 10, [3] * 10 + [2] * 10])
-    keys = jax.random.split(jax.random.key(7))
-    together = jax.vmap(lambda a, k: locomotion.simulate(*runner, a, k))(actions, keys)
-    for i in range(2):
-        alone = locomotion.simulate(*runner, actions[i], keys[i])
-        for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
-            np.testing.assert_allclose(a[i], b, atol=2e-4)
+def test_vmap_equals_the_loop(transitions, play):
+    for pair in ((0, 1), (3, 2)):
+        alone = play(script(pair), KEYS[PAIRS.index(pair)])
+        for a, b in zip(jax.tree.leaves(transitions[pair]), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(a, b, atol=2e-4)
 
 
 def test_the_feet_do_not_enter_the_ground_and_return_to_it(runner, transitions):
@@ -115,9 +127,8 @@ def test_no_pose_jumps_at_a_transition(runner, transitions):
         assert steps[BEFORE - 2 : BEFORE + 15].max() < 1.3 * fastest, pair
 
 
-def test_the_motion_turns_with_the_world(runner):
+def test_the_motion_turns_with_the_world(play):
     key = jax.random.key(3)
-    north = locomotion.simulate(*runner, jnp.array([1] * 15 + [3] * 25), key)
-    west = locomotion.simulate(*runner, jnp.array([3] * 15 + [2] * 25), key)
+    north, west = play([1] * 15 + [3] * 25, key), play([3] * 15 + [2] * 25, key)
     turn = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], np.float32)
     np.testing.assert_allclose(np.einsum("ab,fjbc->fjac", turn, north.transforms), west.transforms, atol=1e-3)
