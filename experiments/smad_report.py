@@ -54,23 +54,20 @@ def write(
     texture = None if experiment.args.videos else np.asarray(avatars.build(experiment.args.avatar).texture)
     results: dict[str, typing.Any] = {}
     fits = dict(zip([take.folder for take in takes["train"]], tracks, strict=True))
-    progress = tqdm(total=sum(map(len, shown.values())), desc="measuring", unit="take")
-    for part, found in shown.items():
-        for take, truth in zip(found, truths[part], strict=True):
-            moved = measures.move(avatar, driving.recorded(take.poses))
-            if take.folder in fits:
-                moved["tracks"] = measures.follow(avatar, fits[take.folder])
-            name = f"{part} {take.folder.name}"
-            recorded = measures.recorded_view(take)
-            results[name] = {"pictures": measures.picture_errors([recorded], moved, perceptual)}
-            if novel := measures.novel_views(take, texture) if texture is not None else []:
-                results[name]["novel views"] = measures.picture_errors(novel, moved, perceptual)
-            if truth is not None:
-                results[name]["nodes"] = {r: measures.node_errors(truth, moved, c) for r, c in regions.items()}
-            if take is found[0] and part != "train":
-                film(folder, part, recorded, moved)
-            progress.update()
-    progress.close()
+    measured = [(part, *pair) for part in shown for pair in zip(shown[part], truths[part], strict=True)]
+    for part, take, truth in tqdm(measured, desc="measuring", unit="take"):
+        moved = measures.move(avatar, driving.recorded(take.poses))
+        if take.folder in fits:
+            moved["tracks"] = measures.follow(avatar, fits[take.folder])
+        name = f"{part} {take.folder.name}"
+        recorded = measures.recorded_view(take)
+        results[name] = {"pictures": measures.picture_errors([recorded], moved, perceptual)}
+        if novel := measures.novel_views(take, texture) if texture is not None else []:
+            results[name]["novel views"] = measures.picture_errors(novel, moved, perceptual)
+        if truth is not None:
+            results[name]["nodes"] = {r: measures.node_errors(truth, moved, c) for r, c in regions.items()}
+        if take is shown[part][0] and part != "train":
+            film(folder, part, recorded, moved)
     speed = measures.frames_a_second(avatar, driving.recorded(canonical.poses))
     known = plain(results) | {"seconds": experiment.clock.seconds, "frames a second": speed}
     atomic.write_text(folder / "metrics.json", json.dumps(known, indent=1))

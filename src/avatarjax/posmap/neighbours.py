@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,7 +51,7 @@ def convolve(
     mutual, so gradients are gathered the same way back.
     """
     there = _padded(values)
-    return sum(there[neighbours[:, k]] @ kernel[k] for k in range(len(STEPS)))
+    return functools.reduce(jnp.add, [there[neighbours[:, k]] @ kernel[k] for k in range(len(STEPS))])
 
 
 def _forward(neighbours, values, kernel):
@@ -61,7 +63,8 @@ def _backward(saved, gradient):
     there = _padded(gradient)
     # The k-th step from the end undoes the k-th from the start.
     back = [there[neighbours[:, len(STEPS) - 1 - k]] for k in range(len(STEPS))]
-    return None, sum(b @ k.T for b, k in zip(back, kernel, strict=True)), jnp.stack([values.T @ b for b in back])
+    to_values = functools.reduce(jnp.add, [b @ k.T for b, k in zip(back, kernel, strict=True)])
+    return None, to_values, jnp.stack([values.T @ b for b in back])
 
 
 convolve.defvjp(_forward, _backward)
