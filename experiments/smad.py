@@ -29,6 +29,8 @@ from tqdm import tqdm
 from avatarjax import smad
 from avatarjax.data import MonocularVideo, avatars, capture, load_monocular
 from avatarjax.data.motion import performances
+from avatarjax.data.motion.locomotion import Motion
+from avatarjax.data.wardrobe.assembly import AvatarMesh
 from avatarjax.gaussians import Gaussians
 from avatarjax.io import atomic
 from avatarjax.physics.xpbd import XPBDConfig
@@ -157,20 +159,25 @@ def film(experiment: Experiment) -> dict[str, list[MonocularVideo]]:
             "test": [load_monocular(path).held() for path in args.test],
         }
     keep_films(experiment.folder / "film", wanted)
-    avatar = None
-    takes: dict[str, list[MonocularVideo]] = {}
-    for part in ("train", "test", "unseen"):
-        takes[part] = []
-        for name, seed in getattr(wanted, part):
-            folder = experiment.folder / "film" / f"{name}-{seed}"
-            if not (folder / capture.MESHES).is_file():
-                avatar = avatar or avatars.build(args.avatar)
-                motion = jax.device_get(performances.perform(avatar.rig, name, seed))
-                with tqdm(total=2 * len(motion.headings), desc=folder.name, unit="frame") as bar:
-                    config = XPBDConfig(substeps=wanted.substeps)
-                    capture.film(folder, avatar, motion, size=wanted.size, config=config, progress=bar.update)
-            takes[part].append(load_monocular(folder).held())
-    return takes
+    avatar = functools.cache(lambda: avatars.build(args.avatar))
+
+    def one(name: str, seed: int) -> MonocularVideo:
+        folder = experiment.folder / "film" / f"{name}-{seed}"
+        return take(folder, avatar, lambda: jax.device_get(performances.perform(avatar().rig, name, seed)), wanted)
+
+    return {part: [one(*each) for each in getattr(wanted, part)] for part in ("train", "test", "unseen")}
+
+
+def take(
+    folder: Path, avatar: Callable[[], AvatarMesh], motion: Callable[[], Motion], wanted: FilmConfig
+) -> MonocularVideo:
+    """A take in its folder: filmed, if it is not there yet, of an avatar in a motion, which are then asked for."""
+    if not (folder / capture.MESHES).is_file():
+        performed = motion()
+        with tqdm(total=2 * len(performed.headings), desc=folder.name, unit="frame") as bar:
+            config = XPBDConfig(substeps=wanted.substeps)
+            capture.film(folder, avatar(), performed, size=wanted.size, config=config, progress=bar.update)
+    return load_monocular(folder).held()
 
 
 def keep_films(folder: Path, wanted: FilmConfig) -> None:
@@ -206,6 +213,14 @@ def learn(
     config: SmadConfig, takes: Sequence[MonocularVideo], refined: tuple[Refined, footage.Footage], run: Run
 ) -> tuple[smad.Avatar, list[Take]]:
     """The avatar with dynamics that were learned from the tracks of its nodes, and these."""
+    avatar, tracks = settle(config, takes, refined, run)
+    return train_pictures.train_swing(avatar, refined[1], run), tracks
+
+
+def settle(
+    config: SmadConfig, takes: Sequence[MonocularVideo], refined: tuple[Refined, footage.Footage], run: Run
+) -> tuple[smad.Avatar, list[Take]]:
+    """The avatar before it has learned to swing: with the equilibrium and the look alone."""
     fitted, shots = refined
     config = dynamics.sized(config, takes[0].poses.rotations.shape[1])
     net, skin = fitted.warp.graph, None
@@ -218,8 +233,7 @@ def learn(
     # Tracks of one camera are mostly what it does not see: pictures have the last word on all that they began.
     params = train_dynamics.train_target(config, system, train_dynamics.record(config, system, tracks), run)
     avatar = smad.Avatar(fitted.gaussians, fitted.warp.binding, system, params, config)
-    avatar = train_pictures.train_drape(avatar, shots, run)
-    return train_pictures.train_swing(avatar, shots, run), tracks
+    return train_pictures.train_drape(avatar, shots, run), tracks
 
 
 def main(argv: list[str] | None = None) -> int:

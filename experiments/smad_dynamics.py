@@ -53,10 +53,11 @@ from experiments.smad_dynamics_tables import (
 from experiments.smad_motions import Motions, Name, Stage, all_of, on_nodes
 
 MOTIONS = Motions()
-MEASURES = 2  # which version of the measures: kept ones of another are taken anew
+MEASURES = 3  # which version of the measures: kept ones of another are taken anew
 
 
-def _net(config: SmadConfig, **changes: typing.Any) -> SmadConfig:
+def net(config: SmadConfig, **changes: typing.Any) -> SmadConfig:
+    """The configuration with another deformer."""
     return dataclasses.replace(config, deformer=dataclasses.replace(config.deformer, **changes))
 
 
@@ -76,28 +77,34 @@ def _longer(config: SmadConfig, times: float) -> SmadConfig:
 
 def _regular(config: SmadConfig) -> SmadConfig:
     """A1: the network says where nodes are, from the state and the poses; no edge features, no learned k_ij."""
-    config = _net(config, edge_features=False, strain=False, adaptive_stiffness=False)
+    config = net(config, edge_features=False, strain=False, adaptive_stiffness=False)
     return dataclasses.replace(config, motion="deltas", equilibrium=False)
 
 
+def _free(config: SmadConfig) -> SmadConfig:
+    """Without the terms of Eq. 11."""
+    pictures = dataclasses.replace(config.pictures, isometry=0.0)
+    return dataclasses.replace(_losses(config, isometry=0.0, damping=0.0), pictures=pictures)
+
+
 def _edges(config: SmadConfig) -> SmadConfig:
-    return _net(_regular(config), adaptive_stiffness=True, edge_features=True, strain=True)
+    return net(_regular(config), adaptive_stiffness=True, edge_features=True, strain=True)
 
 
 # Each learned method by its name, as a change of the preset; the letters are those of SMAD Tables 2 and 4.
 LEARNED: dict[str, Callable[[SmadConfig], SmadConfig]] = {
     OURS: lambda c: c,
-    "MLP": lambda c: _net(c, iterations=0),
-    "vanilla GNN": lambda c: _net(c, edge_features=False, strain=False, adaptive_stiffness=False),
-    "A0 base": lambda c: _losses(_regular(c), isometry=0.0, damping=0.0),
+    "MLP": lambda c: net(c, iterations=0),
+    "vanilla GNN": lambda c: net(c, edge_features=False, strain=False, adaptive_stiffness=False),
+    "A0 base": lambda c: _free(_regular(c)),
     "A1 + losses": _regular,
-    "A2 + learned k_ij": lambda c: _net(_regular(c), adaptive_stiffness=True),
+    "A2 + learned k_ij": lambda c: net(_regular(c), adaptive_stiffness=True),
     "A3 + edge features": _edges,
     "A5 + springs, Euler step": lambda c: dataclasses.replace(_edges(c), motion="springs"),
-    "B0 no velocities": lambda c: _net(c, velocities=0),
-    "B1 tau_v = 1": lambda c: _net(c, velocities=2),
-    "B2 tau_v = 7": lambda c: _net(c, velocities=8),
-    "B3 tau_v = 15": lambda c: _net(c, velocities=16),
+    "B0 no velocities": lambda c: net(c, velocities=0),
+    "B1 tau_v = 1": lambda c: net(c, velocities=2),
+    "B2 tau_v = 7": lambda c: net(c, velocities=8),
+    "B3 tau_v = 15": lambda c: net(c, velocities=16),
     "C1 half the nodes": lambda c: _nodes(c, 0.5),
     "C3 twice the nodes": lambda c: _nodes(c, 2.0),
     "equilibrium of the network alone": lambda c: _losses(c, components=0),
@@ -189,6 +196,7 @@ def one(
     system = train_dynamics.fit_system(config, graph, skin, learned)
     params = train_dynamics.train(config, system, learned, Run(place, seed, mark))
     recorded = train_dynamics.record(config, system, learned)
+    system = train_dynamics.knowing(config, params, system, recorded)
     methods: dict[str, Method] = {name: measures.of_avatar(config, params, system)}
     if name == OURS:
         methods |= yardsticks(config, params, system, recorded)

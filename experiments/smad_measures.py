@@ -116,11 +116,24 @@ def novel_views(take: MonocularVideo, texture: UInt8[np.ndarray, "h w 3"]) -> li
 def picture_errors(
     views: Sequence[View], moved: dict[str, Moved], perceptual: lpips.Network | None
 ) -> dict[str, dict[str, Estimate]]:
-    """PSNR of the whole picture over black and inside the mask, SSIM and LPIPS of each method, over measured frames of
-    all views; those of one frame count together."""
+    """What `picture_values` are on average; those of one frame count together."""
+    values = picture_values(views, moved, perceptual)
+    groups = np.tile(np.asarray(measured_frames(views[0].frames)), len(views))
+    return {name: {what: bootstrap(found, groups) for what, found in kinds.items()} for name, kinds in values.items()}
+
+
+def measured_frames(count: int) -> range:
+    """The frames of a take of so many that are drawn."""
+    return range(SETTLE, count, EVERY)
+
+
+def picture_values(
+    views: Sequence[View], moved: dict[str, Moved], perceptual: lpips.Network | None
+) -> dict[str, dict[str, list[float]]]:
+    """PSNR of the whole picture over black and inside the mask, SSIM and LPIPS of each method, for every measured frame
+    of one view after the other."""
     values: dict[str, dict[str, list[float]]] = {name: {} for name in moved}
-    frames = range(SETTLE, views[0].frames, EVERY)
-    for view, frame in itertools.product(views, frames):
+    for view, frame in itertools.product(views, measured_frames(views[0].frames)):
         camera, truth, inside = view.at(frame)
         mask = jnp.asarray(inside[..., None], jnp.float32)
         for name, method in moved.items():
@@ -134,8 +147,7 @@ def picture_errors(
                 found["LPIPS"] = lpips.distance(perceptual, drawn, truth)
             for what, value in found.items():
                 values[name].setdefault(what, []).append(float(value))
-    groups = np.tile(np.asarray(frames), len(views))
-    return {name: {what: bootstrap(found, groups) for what, found in kinds.items()} for name, kinds in values.items()}
+    return values
 
 
 def over_black(picture: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"]) -> jax.Array:

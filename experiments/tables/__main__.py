@@ -12,12 +12,13 @@
     python -m experiments.tables components novelty trail strips   # Figs. B, C (f), 5, I to L
     python -m experiments.tables monocular --preset ci         # SMAD's Tables 1, 3 and I
     python -m experiments.tables initialisation --preset ci --avatars cowgirl    # SMAD's Fig. 6, right; minutes
+    python -m experiments.tables deformers long_takes --preset ci --avatars cowgirl    # SMAD's Tables 2, 4, 5; an hour
 
-Runs are those of `python -m experiments.unica --avatar NAME --train` under OUT/unica/NAME/PRESET, and for `monocular`
-and `initialisation` those of `python -m experiments.smad --avatar NAME` under OUT/smad/NAME/PRESET; `initialisation`
-needs no more than their stage `film`. Results go to OUT/tables/PRESET/: NAME.md with its pictures, and what was
-measured in cells.json, so that an interrupted table goes on. SV4D and the user study of UNICA are not reproduced;
-SMAD's Tables 2 and 4 to K: experiments.smad_dynamics.
+Runs are those of `python -m experiments.unica --avatar NAME --train` under OUT/unica/NAME/PRESET, and for SMAD's tables
+those of `python -m experiments.smad --avatar NAME` under OUT/smad/NAME/PRESET; `initialisation` needs no more than
+their stage `film`. Results go to OUT/tables/PRESET/: NAME.md with its pictures, and what was measured in cells.json, so
+that an interrupted table goes on. SV4D and the user study of UNICA are not reproduced; SMAD's Tables 2 to 5, J and K in
+millimetres, and its Figs. 6, 7, I and J: experiments.smad_dynamics.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from avatarjax.unica.config import DynamicsName, PresetName
 from experiments import command_line
 from experiments.tables import (
     context,
+    deformers,
     feed_forward,
     figures,
     images,
@@ -65,7 +67,12 @@ Name = typing.Literal[
     "strips",
     "monocular",
     "initialisation",
+    "deformers",
+    "long_takes",
 ]
+
+# Tables of finished runs of experiments.smad.
+OF_VIDEOS = {"monocular", "deformers", "long_takes"}
 
 
 @dataclasses.dataclass
@@ -88,13 +95,12 @@ class Args:
 
 def run_tables(args: Args) -> list[Table]:
     """Measure, print and write the tables. Raises ValueError where there is no finished run."""
-    videos = folders(args, "smad", "--avatar {}") if "monocular" in args.names else []
+    names = set(args.names)
+    videos = folders(args, "smad", "--avatar {}") if names & OF_VIDEOS else []
     films = (
-        folders(args, "smad", "--stage film --avatar {}", initialisation.filmed)
-        if "initialisation" in args.names
-        else []
+        folders(args, "smad", "--stage film --avatar {}", initialisation.filmed) if "initialisation" in names else []
     )
-    others = set(args.names) - {"monocular", "initialisation"}
+    others = names - OF_VIDEOS - {"initialisation"}
     runs = [Finished(f) for f in folders(args, "unica", "--avatar {} --train")] if others else []
     folder = args.out / "tables" / args.preset
     folder.mkdir(parents=True, exist_ok=True)
@@ -115,6 +121,8 @@ def run_tables(args: Args) -> list[Table]:
         "strips": lambda: figures.strips(runs, folder),
         "monocular": lambda: monocular.monocular(videos),
         "initialisation": lambda: initialisation.initialisation(films, notebook, folder),
+        "deformers": lambda: deformers.deformers(videos, notebook, folder),
+        "long_takes": lambda: deformers.long_takes(videos, notebook, folder),
     }
     made = []
     for name in args.names:

@@ -11,7 +11,7 @@ from avatarjax.gaussians import Gaussians
 from avatarjax.io import weights
 from avatarjax.smad import avatar as smad
 from avatarjax.smad import config as configs
-from avatarjax.smad import dynamics, embedded, files, graph, skeletal
+from avatarjax.smad import drape, dynamics, embedded, files, graph, kernel, skeletal
 from avatarjax.smad.deformer import Deltas
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.dynamics import Scaling, System
@@ -99,7 +99,10 @@ def test_a_file_keeps_the_avatar(avatar, tmp_path):
     poses, names, parents = motion(1), ("hips", "spine"), (-1, 0)
     rig = Rig(jnp.array([[0.0, 1.0, 0.0], [0.0, 1.2, 0.0]]), jnp.zeros((2, 3)), jnp.zeros((2, 0, 3)), names, parents)
     skinned = avatar.system.replace(skin=skeletal.bind(rig, at(poses, 0), avatar.system.graph.positions))
-    for whole in (avatar, avatar.replace(system=skinned)):
+    features, first = jax.random.normal(jax.random.key(0), (20, CONFIG.deformer.pose)), jnp.zeros(20, int)
+    known = dynamics.Known(kernel.fit(features, first), jnp.ones(CONFIG.deformer.pose_embedding))
+    draped = skinned.replace(known=known, drape=drape.fit(jnp.ones((20, NODES, 3)), features, first, components=2))
+    for whole in (avatar, avatar.replace(system=skinned), avatar.replace(system=draped)):
         files.save(tmp_path / "avatar.safetensors", whole)
         again = files.load(tmp_path)
         assert again.config == CONFIG
@@ -112,7 +115,7 @@ def test_a_file_that_is_none_is_refused(avatar, tmp_path):
         files.load("nobody", runs=tmp_path)
     path = tmp_path / "avatar.safetensors"
     weights.save_tree(path, {"a": np.zeros(1)})
-    with pytest.raises(ValueError, match="no SMAD avatar of version 3"):
+    with pytest.raises(ValueError, match=f"no SMAD avatar of version {files.VERSION}"):
         files.load(path)
     files.save(path, avatar)
     arrays, metadata = weights.load_arrays(path)

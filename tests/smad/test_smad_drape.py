@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from avatarjax.smad import drape, driving, linear
+from avatarjax.smad import drape, driving, kernel, linear
 
 FRAMES, STRIDE, WINDOW = 120, 2, 3
 
@@ -42,13 +42,9 @@ def test_with_every_window_a_centre_it_is_kernel_ridge_regression(takes):
     offsets, features, first = (np.asarray(x) for x in takes)
     found = fit(takes, ridge=0.2, centres=len(features))
     poses = windows(features.astype(np.float64), first)
-    points = (poses.reshape(len(poses), -1) - np.asarray(found.window_mean)) @ np.asarray(found.projection, np.float64)
-    apart = np.sum((points[:, None] - points[None]) ** 2, axis=-1)
-    # The width is that share of the mean squared distance of two windows.
-    np.testing.assert_allclose(found.width, drape.WIDTH * apart.mean(), rtol=1e-4)
-    kernel = np.exp(-apart / float(found.width))
+    near = np.asarray(jax.vmap(lambda window: kernel.near(found.kernel, window))(jnp.asarray(poses, jnp.float32)))
     flat = (offsets - offsets.mean(0)).reshape(len(offsets), -1)
-    expected = kernel @ np.linalg.solve(kernel + 0.2 * np.eye(len(kernel)), flat)
+    expected = near @ np.linalg.solve(near.astype(np.float64) + 0.2 * np.eye(len(near)), flat)
     here = lie(found, poses[::7])
     np.testing.assert_allclose(here - found.mean[None], expected[::7].reshape(here.shape), atol=2e-4)
 

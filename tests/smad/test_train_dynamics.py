@@ -103,6 +103,24 @@ def test_the_equilibrium_departs_from_the_drape(system, takes):
     assert train_dynamics.fit_system(without, system.graph, None, takes).drape is None
 
 
+def test_what_is_unlike_all_that_was_learned_from_has_the_usual_equilibrium(bare, takes):
+    recorded = train_dynamics.record(CONFIG, bare, takes)
+    params = dynamics.init(CONFIG, bare, jax.random.key(0))
+    target = jax.random.normal(jax.random.key(1), params["target"].shape)
+    params = params | {"target": target}
+    system = train_dynamics.knowing(CONFIG, params, bare, recorded)
+    window = train_dynamics.window_at(CONFIG, recorded, jnp.asarray(40))
+    known, here = (dynamics.settled(CONFIG, params, s, window) for s in (bare, system))
+    np.testing.assert_allclose(here, known, atol=0.02 * float(jnp.abs(known).max()))
+    every = [train_dynamics.window_at(CONFIG, recorded, jnp.asarray(k)) for k in range(len(recorded.first))]
+    mean = jnp.mean(jax.vmap(lambda w: dynamics.settled(CONFIG, params, bare, w))(jnp.stack(every)), axis=0)
+    np.testing.assert_allclose(dynamics.settled(CONFIG, params, system, window + 50), mean, atol=1e-4)
+    apart = dynamics.settled(CONFIG, params, bare, window + 50) - mean
+    assert float(jnp.abs(apart).max()) > 0.1
+    free = dataclasses.replace(CONFIG, equilibrium=False)
+    assert train_dynamics.knowing(free, params, bare, recorded) is bare
+
+
 def test_the_terms_of_the_loss_are_as_printed(bare):
     system, params = bare, dynamics.init(CONFIG, bare, jax.random.key(0))
     poses = jax.tree.map(lambda x: x[:2], swinging(0).poses)

@@ -28,11 +28,12 @@ from jaxtyping import Array, Float, Key
 from avatarjax.nets.functional import Params
 from avatarjax.physics import mass_spring_damper as msd
 from avatarjax.physics.mass_spring_damper import Springs
-from avatarjax.smad import deformer, drape, driving, skeletal
+from avatarjax.smad import deformer, drape, driving, kernel, skeletal
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.drape import Drape
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.graph import Graph
+from avatarjax.smad.kernel import Kernel
 from avatarjax.smad.skeletal import Skin
 
 # Numbers of a node beside its place and velocities: at rest, offset, swing, the surface's motion.
@@ -59,9 +60,19 @@ class Scaling:
 
 @typing.no_type_check
 @flax.struct.dataclass
+class Known:
+    """The windows of poses that were learned from, and the mean (e,) of the network's embeddings of them."""
+
+    kernel: Kernel
+    embedding: Float[Array, "e"]
+
+
+@typing.no_type_check
+@flax.struct.dataclass
 class System:
-    """What dynamics are learned for: the graph, what drives its nodes, scaling, and the drape of a window of poses in
-    closed form, from which the learned equilibrium departs (none: from no offset).
+    """What dynamics are learned for: the graph, what drives its nodes, scaling, the drape of a window of poses in
+    closed form, from which the learned equilibrium departs (none: from no offset), and what that is known of (none:
+    it is trusted everywhere).
 
     Without a skin (its joints are not known) the nodes' places at rest are the driven surface.
     """
@@ -70,6 +81,7 @@ class System:
     skin: Skin | None
     scaling: Scaling
     drape: Drape | None = None
+    known: Known | None = None
 
 
 @typing.no_type_check
@@ -143,11 +155,16 @@ def pose_features(config: SmadConfig, system: System, poses: Pose) -> Float[Arra
 
 def settled(config: SmadConfig, params: Params, system: System, window: Float[Array, "w p"]) -> Float[Array, "n 3"]:
     """The offset that a window of poses alone determines: the drape, and a linear reading of the network's own
-    embedding of the window."""
+    embedding of the window. The less the window is like any that were learned from, the nearer that is drawn to the
+    mean embedding, as a network goes on where nothing tells it to."""
     if not config.equilibrium:
         return jnp.zeros(params["target"].shape[1:])
     window = window[:: config.deformer.pose_stride]
-    learned = jnp.tensordot(deformer.embed(config.deformer, params["deformer"], window), params["target"], 1)
+    embedding = deformer.embed(config.deformer, params["deformer"], window)
+    if system.known is not None:
+        usual, trust = system.known.embedding, jnp.max(kernel.near(system.known.kernel, window))
+        embedding = usual + trust * (embedding - usual)
+    learned = jnp.tensordot(embedding, params["target"], 1)
     return learned if system.drape is None else learned + drape.offsets(system.drape, window)
 
 

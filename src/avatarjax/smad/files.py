@@ -15,12 +15,13 @@ from avatarjax.io import weights
 from avatarjax.smad.avatar import Avatar
 from avatarjax.smad.config import PRESETS, SmadConfig
 from avatarjax.smad.drape import Drape
-from avatarjax.smad.dynamics import Scaling, System
+from avatarjax.smad.dynamics import Known, Scaling, System
 from avatarjax.smad.embedded import Binding
 from avatarjax.smad.graph import Graph
+from avatarjax.smad.kernel import Kernel
 from avatarjax.smad.skeletal import Skin
 
-VERSION = 3
+VERSION = 4
 FILE = "avatar.safetensors"
 
 
@@ -66,11 +67,17 @@ def _read(path: Path) -> Avatar:
         if metadata["skeleton"] is not None:
             names, parents = (tuple(metadata["skeleton"][part]) for part in ("names", "parents"))
             skin = Skin(Rig(**system["skin"]["rig"], names=names, parents=parents), system["skin"]["basis"])
-        drape = Drape(**system["drape"]) if "drape" in system else None
+        drape, known = system.get("drape"), system.get("known")
         return Avatar(
             gaussians=Gaussians(**tree["gaussians"]),
             binding=Binding(**tree["binding"]),
-            system=System(Graph(**system["graph"]), skin, Scaling(**system["scaling"]), drape),
+            system=System(
+                Graph(**system["graph"]),
+                skin,
+                Scaling(**system["scaling"]),
+                None if drape is None else Drape(**drape | {"kernel": Kernel(**drape["kernel"])}),
+                None if known is None else Known(**known | {"kernel": Kernel(**known["kernel"])}),
+            ),
             params=tree["params"],
             config=config,
         )

@@ -18,11 +18,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from avatarjax.nets.functional import Params
-from avatarjax.smad import drape, driving, dynamics
+from avatarjax.smad import deformer, drape, driving, dynamics, kernel
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.deformer import Deltas
 from avatarjax.smad.driving import Pose
-from avatarjax.smad.dynamics import Scaling, State, System
+from avatarjax.smad.dynamics import Known, Scaling, State, System
 from avatarjax.smad.graph import Graph
 from avatarjax.smad.skeletal import Skin
 from avatarjax.train import Run, train_stage
@@ -94,6 +94,23 @@ def fit_system(config: SmadConfig, graph: Graph, skin: Skin | None, takes: Seque
         centres=settings.centres,
     )
     return system.replace(drape=fitted)
+
+
+def knowing(config: SmadConfig, params: Params, system: System, recorded: Recorded) -> System:
+    """The system that knows which windows its equilibrium was learned from: those of the recording. Without an
+    equilibrium it is returned as it is."""
+    if not config.equilibrium:
+        return system
+    net = config.deformer
+    options = {"window": net.pose_window, "stride": net.pose_stride, "centres": config.dynamics.centres}
+    fitted = kernel.fit(recorded.features, recorded.first, **options)
+    frames = jnp.arange(len(recorded.first))
+
+    def embedding(frame):
+        window = window_at(config, recorded, frame)[:: net.pose_stride]
+        return deformer.embed(net, params["deformer"], window)
+
+    return system.replace(known=Known(fitted, jnp.mean(jax.lax.map(embedding, frames, batch_size=256), axis=0)))
 
 
 def record(config: SmadConfig, system: System, takes: Sequence[Take]) -> Recorded:

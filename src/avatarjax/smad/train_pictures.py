@@ -62,7 +62,9 @@ def train_drape(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
     encoded = refine.encode(avatar.gaussians)
     start = {"dynamics": avatar.params, "look": {name: encoded[name] for name in LOOK}}
     trained = train_stage(run, "drape", settings.drape_stage, config, loss, start, batch_at)
-    return avatar.replace(params=trained["dynamics"], gaussians=_with_look(avatar.gaussians, trained["look"]))
+    params = trained["dynamics"]
+    system = train_dynamics.knowing(config, params, avatar.system, recorded)
+    return avatar.replace(system=system, params=params, gaussians=_with_look(avatar.gaussians, trained["look"]))
 
 
 def train_swing(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
