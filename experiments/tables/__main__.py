@@ -13,6 +13,7 @@
     python -m experiments.tables monocular --preset ci         # SMAD's Tables 1, 3 and I
     python -m experiments.tables initialisation --preset ci --avatars cowgirl    # SMAD's Fig. 6, right; minutes
     python -m experiments.tables deformers long_takes --preset ci --avatars cowgirl    # SMAD's Tables 2, 4, 5; an hour
+    python -m experiments.tables fusion --preset ci --avatars cowgirl     # SMAD's feature fusion: five ways, minutes
 
 Runs are those of `python -m experiments.unica --avatar NAME --train` under OUT/unica/NAME/PRESET, and for SMAD's tables
 those of `python -m experiments.smad --avatar NAME` under OUT/smad/NAME/PRESET; `initialisation` needs no more than
@@ -40,6 +41,7 @@ from experiments.tables import (
     deformers,
     feed_forward,
     figures,
+    fusion,
     images,
     initialisation,
     long,
@@ -69,10 +71,11 @@ Name = typing.Literal[
     "initialisation",
     "deformers",
     "long_takes",
+    "fusion",
 ]
 
 # Tables of finished runs of experiments.smad.
-OF_VIDEOS = {"monocular", "deformers", "long_takes"}
+OF_VIDEOS = {"monocular", "deformers", "long_takes", "fusion"}
 
 
 @dataclasses.dataclass
@@ -122,6 +125,7 @@ def run_tables(args: Args) -> list[Table]:
         "monocular": lambda: monocular.monocular(videos),
         "initialisation": lambda: initialisation.initialisation(films, notebook, folder),
         "deformers": lambda: deformers.deformers(videos, notebook, folder),
+        "fusion": lambda: fusion.fusion(videos, notebook, folder),
         "long_takes": lambda: deformers.long_takes(videos, notebook, folder),
     }
     made = []

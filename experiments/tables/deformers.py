@@ -144,7 +144,7 @@ class Workshop:
         for take in takes:
             moved = measures.move(avatar, driving.recorded(take.poses))[name]
             drawn = measures.Moved(lambda frame, moved=moved: visible(moved.gaussians(frame)), moved.nodes)
-            values = measures.picture_values([measures.recorded_view(take)], {name: drawn}, _perceptual())[name]
+            values = measures.picture_values([measures.recorded_view(take)], {name: drawn}, perceptual())[name]
             truth = _known(measures.true_nodes(avatar, canonical, take))
             errors = np.linalg.norm(moved.nodes[:, loose] - truth[1:, loose], axis=-1).mean(axis=1)
             errors = 1000 * np.minimum(np.nan_to_num(errors, nan=1.0, posinf=1.0), 1.0)
@@ -261,5 +261,6 @@ def _known(nodes: np.ndarray | None) -> np.ndarray:
 
 
 @functools.cache
-def _perceptual() -> lpips.Network | None:
+def perceptual() -> lpips.Network | None:
+    """The network of LPIPS, read once, where it is there."""
     return lpips.load("alex") if pretrained.available("alex") else None

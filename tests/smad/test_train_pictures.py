@@ -8,9 +8,20 @@ import numpy as np
 import pytest
 
 from avatarjax.smad import config as configs
-from avatarjax.smad import driving, dynamics, embedded, footage, graph, skeletal, train_dynamics, train_pictures
+from avatarjax.smad import (
+    driving,
+    dynamics,
+    embedded,
+    footage,
+    fusion,
+    graph,
+    skeletal,
+    train_dynamics,
+    train_pictures,
+)
 from avatarjax.smad.avatar import Avatar
 from avatarjax.smad.config import PicturesConfig
+from avatarjax.smad.fusion import FusionConfig
 from avatarjax.smad.train_dynamics import Take
 from avatarjax.train import Run, StageConfig, read_metrics
 from tests.smad import swaying
@@ -80,6 +91,24 @@ def test_rollouts_begin_calm_and_are_learned_from(doll, draped, tmp_path):
     errors = [record["photometric"] for record in read_metrics(tmp_path / "swing.jsonl")]
     assert np.mean(errors[-5:]) < 0.95 * np.mean(errors[:5])
     assert float(jnp.abs(swinging.params["inertia"]).max()) > 0
+
+
+def test_colours_are_fused_from_frames_of_the_first_take(doll, tmp_path):
+    """Gaussians of one grey, which what the frames show makes the doll's own again."""
+    takes, avatar, _ = doll
+    grey = avatar.replace(gaussians=avatar.gaussians.replace(colors=jnp.full_like(avatar.gaussians.colors, 0.5)))
+    config = FusionConfig(views=4, width=2, stage=StageConfig(30, 2, 1e-2))
+    learned, fused = train_pictures.train_fusion(grey, takes, config, Run(tmp_path, 0, "doll"))
+    assert fused is not None
+    params, views = fused
+    towards = fusion.direction(jax.tree.map(lambda x: jnp.asarray(x[0]), takes.cameras))
+    seen = np.asarray(views.seen).any(axis=0)
+    found = fusion.fuse(config, params, views, learned.gaussians, towards).colors
+    before, after = (
+        np.abs(np.asarray(x - avatar.gaussians.colors))[seen].mean() for x in (grey.gaussians.colors, found)
+    )
+    assert seen.mean() > 0.2 and after < 0.8 * before
+    assert learned.system is grey.system and learned.params is grey.params
 
 
 @pytest.mark.parametrize("train", [train_pictures.train_drape, train_pictures.train_swing])

@@ -186,17 +186,25 @@ def _add_picture(
     mask: Bool[Array, "h w"],
     camera: Camera,
 ) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
+    row, column, visible = visible_at(points, edge, mask, camera)
+    towards = camera.position[None] - points
+    cosine = jnp.sum(normals * towards, -1) / jnp.maximum(jnp.linalg.norm(towards, axis=-1), 1e-6)
+    weight = jnp.where(visible, jnp.maximum(cosine, 0.0) ** _FACING, 0.0)
+    return sums + weight[:, None] * picture[row, column].astype(jnp.float32) / 255, weights + weight
+
+
+def visible_at(
+    points: Float[Array, "n 3"], edge: Float[Array, ""], mask: Bool[Array, "h w"], camera: Camera
+) -> tuple[Int[Array, " n"], Int[Array, " n"], Bool[Array, " n"]]:
+    """Row and column of the pixel of each point, and whether that shows it: the mask has it and no other point lies in
+    front of it. `edge` is the distance of the points to their neighbours."""
     row, column, seen, depth = _pixels(camera, points)
     # A depth buffer with cells as wide as the points lie apart, so that a surface in front leaves no gaps.
     focal = camera.intrinsics[0, 0]
     cell = jnp.maximum(1.0, 1.5 * focal * edge / jnp.median(jnp.maximum(depth, edge)))
     place = (row / cell).astype(jnp.int32), (column / cell).astype(jnp.int32)
     front = jnp.full(mask.shape, jnp.inf).at[place].min(jnp.where(seen, depth, jnp.inf))
-    visible = seen & mask[row, column] & (depth < front[place] + _HIDDEN * edge)
-    towards = camera.position[None] - points
-    cosine = jnp.sum(normals * towards, -1) / jnp.maximum(jnp.linalg.norm(towards, axis=-1), 1e-6)
-    weight = jnp.where(visible, jnp.maximum(cosine, 0.0) ** _FACING, 0.0)
-    return sums + weight[:, None] * picture[row, column].astype(jnp.float32) / 255, weights + weight
+    return row, column, seen & mask[row, column] & (depth < front[place] + _HIDDEN * edge)
 
 
 def _pixels(

@@ -4,6 +4,7 @@ First `train_drape`: the equilibrium, which is what a window of poses alone says
 frames. All frames share it, so that a side that one frame hides is learned from others in which the person stood
 otherwise; tracks (`refine`), which belong to one frame each, are only where it starts from. Then `train_swing`:
 everything, through rollouts (Eq. 10), which begin in frames as if the clothes had always been at their equilibrium.
+`train_fusion` is an option beside them: colours that depend on where a camera stands.
 """
 
 from __future__ import annotations
@@ -14,14 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.spatial import cKDTree
 
 from avatarjax.gaussians import Gaussians
 from avatarjax.nets.functional import Params
 from avatarjax.smad import avatar as smad
-from avatarjax.smad import dynamics, embedded, footage, refine, train_dynamics
+from avatarjax.smad import dynamics, embedded, footage, fusion, refine, train_dynamics
 from avatarjax.smad.avatar import Avatar
 from avatarjax.smad.footage import Footage
+from avatarjax.smad.fusion import FusionConfig, Views
 from avatarjax.smad.train_dynamics import Recorded, Take
+from avatarjax.smad.views import spread
 from avatarjax.splat import SplatConfig, l1, render
 from avatarjax.train import Run, train_stage
 from avatarjax.train.state import Metrics
@@ -49,10 +53,7 @@ def train_drape(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
         gaussians = _with_look(fixed.gaussians, params["look"])
 
         def one(frame):
-            window = train_dynamics.window_at(config, recorded, frame)
-            offset = dynamics.settled(config, params["dynamics"], fixed.system, window)
-            pose = jax.tree.map(lambda x: x[frame], recorded.poses)
-            nodes = dynamics.driven(fixed.system, pose) + offset
+            nodes, offset = _at(fixed.replace(params=params["dynamics"]), recorded, frame)
             cloud = embedded.carry(fixed.binding, gaussians, fixed.system.graph, nodes)
             return cloud, nodes, offset
 
@@ -99,6 +100,67 @@ def train_swing(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
     hold = train_dynamics.hold_equilibrium(config)
     params = train_stage(run, "swing", settings.swing_stage, config, loss, avatar.params, batch_at, hold)
     return avatar.replace(params=params)
+
+
+def train_fusion(
+    avatar: Avatar, takes: Footage, config: FusionConfig | None, run: Run
+) -> tuple[Avatar, tuple[Params, Views] | None]:
+    """The avatar with colours that were learned on at its equilibrium, all else held, and beside them parameters and
+    views of the fusion (`fusion.fuse`) that were learned with them, for the same steps; None leaves that out."""
+    stage = (config or FusionConfig()).stage
+    recorded, splat = _recorded(avatar, takes), _room(avatar, takes)
+    frames = np.flatnonzero(~takes.held_out)
+    start = {"colors": refine.encode(avatar.gaussians)["colors"]}
+    views = None
+    if config is not None:
+        views = views_of(avatar, takes, config.views)
+        start["fusion"] = fusion.init(config, run.key("fusion"))
+
+    def batch_at(step):
+        chosen = np.random.default_rng([run.seed, step]).choice(frames, stage.batch)
+        fixed = {"avatar": avatar, "recorded": recorded, "seen": views}
+        return fixed | _views(takes, chosen) | {"frames": chosen.astype(np.int32)}
+
+    def loss(params, key, batch):
+        dressed = batch["avatar"].replace(gaussians=_with_look(batch["avatar"].gaussians, {"colors": params["colors"]}))
+        background = jax.random.uniform(key, (3,))
+
+        def missed(shot):
+            frame, camera, rgba = shot
+            cloud = _carried(dressed, batch["recorded"], frame)
+            if config is not None:
+                cloud = fusion.fuse(config, params["fusion"], batch["seen"], cloud, fusion.direction(camera))
+            return l1(render(cloud, camera, background=background, config=splat).image, footage.over(rgba, background))
+
+        return jnp.mean(jax.lax.map(missed, (batch["frames"], batch["cameras"], batch["rgba"]))), {}
+
+    trained = train_stage(run, "fusion", stage, (avatar.config, config), loss, start, batch_at)
+    avatar = avatar.replace(gaussians=_with_look(avatar.gaussians, {"colors": trained["colors"]}))
+    return avatar, None if views is None else (trained["fusion"], views)
+
+
+def views_of(avatar: Avatar, takes: Footage, count: int) -> Views:
+    """What so many frames of the first take, spread evenly over those that are trained on, show of the Gaussians."""
+    first = np.flatnonzero(~takes.held_out[: takes.takes[0]])
+    frames = first[spread(len(first), count)]
+    recorded = _recorded(avatar, takes)
+    means = jax.lax.map(lambda frame: _carried(avatar, recorded, frame).means, jnp.asarray(frames))
+    nearest = cKDTree(np.asarray(avatar.gaussians.means)).query(np.asarray(avatar.gaussians.means), 2)[0][:, 1]
+    shown = {name: jax.tree.map(jnp.asarray, x) for name, x in _views(takes, frames).items()}
+    return fusion.gather(means, jnp.asarray(np.median(nearest), jnp.float32), shown["rgba"], shown["cameras"])
+
+
+def _at(avatar: Avatar, recorded: Recorded, frame: Int[Array, ""]) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    """The nodes at their equilibrium in a frame, and its offset."""
+    window = train_dynamics.window_at(avatar.config, recorded, frame)
+    offset = dynamics.settled(avatar.config, avatar.params, avatar.system, window)
+    pose = jax.tree.map(lambda x: x[frame], recorded.poses)
+    return dynamics.driven(avatar.system, pose) + offset, offset
+
+
+def _carried(avatar: Avatar, recorded: Recorded, frame: Int[Array, ""]) -> Gaussians:
+    """The Gaussians at the equilibrium in a frame, in its body frame."""
+    return embedded.carry(avatar.binding, avatar.gaussians, avatar.system.graph, _at(avatar, recorded, frame)[0])
 
 
 def _total(
