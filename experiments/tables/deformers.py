@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import itertools
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -130,7 +130,7 @@ class Workshop:
             params = train_dynamics.train(config, avatar.system, tracks, run)
         return train_pictures.train_swing(avatar.replace(config=config, params=params), takes, run)
 
-    def measured(self, method: str, takes: Iterable[MonocularVideo]) -> list[Values]:
+    def measured(self, method: str, takes: Mapping[str, Sequence[MonocularVideo]]) -> dict[str, list[Values]]:
         """Of each measured frame of some takes what a method's pictures are like, and how far its loose nodes are off.
 
         Nodes that are lost count as a metre away.
@@ -140,15 +140,19 @@ class Workshop:
         canonical, known = self.takes["train"][0], self.shown("train")
         truths = [_known(measures.true_nodes(avatar, canonical, take)) for take in known]
         loose = measures.loose_nodes(avatar, truths, [driving.recorded(take.poses) for take in known])
-        found = []
-        for take in takes:
+
+        def one(take: MonocularVideo) -> Values:
             moved = measures.move(avatar, driving.recorded(take.poses))[name]
-            drawn = measures.Moved(lambda frame, moved=moved: visible(moved.gaussians(frame)), moved.nodes)
+            drawn = measures.Moved(lambda frame: visible(moved.gaussians(frame)), moved.nodes)
             values = measures.picture_values([measures.recorded_view(take)], {name: drawn}, perceptual())[name]
             truth = _known(measures.true_nodes(avatar, canonical, take))
             errors = np.linalg.norm(moved.nodes[:, loose] - truth[1:, loose], axis=-1).mean(axis=1)
             errors = 1000 * np.minimum(np.nan_to_num(errors, nan=1.0, posinf=1.0), 1.0)
-            found.append(values | {"loose": [float(errors[k - 1]) for k in measures.measured_frames(len(take))]})
+            return values | {"loose": [float(errors[k - 1]) for k in measures.measured_frames(len(take))]}
+
+        found = {part: [one(take) for take in some] for part, some in takes.items()}
+        # A process may hold so many memory mappings, and each method compiles programs of its own.
+        jax.clear_caches()
         return found
 
 
@@ -166,11 +170,9 @@ def deformers(folders: list[Path], notebook: Notebook, folder: Path) -> Table:
     remarks = []
     for run in folders:
         shop = Workshop(run, folder / "deformers" / run.parent.name)
-        found: dict[str, dict[str, list[Values]]] = {}
-        for method in METHODS:
-            parts = [functools.partial(shop.measured, method, shop.shown(part)) for part in PARTS]
-            names = [f"{shop.name}, {method}, {part}" for part in PARTS]
-            found[method] = dict(zip(PARTS, map(notebook.measured, names, parts), strict=True))
+        takes = {part: shop.shown(part) for part in PARTS}
+        works = {method: functools.partial(shop.measured, method, takes) for method in METHODS}
+        found = {method: notebook.measured(f"{shop.name}, {method}", work) for method, work in works.items()}
         for method, (_, printed) in METHODS.items():
             cells = [pooled(found[method][part], "PSNR") for part in PARTS]
             test = found[method]["test"]
@@ -203,14 +205,14 @@ def long_takes(folders: list[Path], notebook: Notebook, folder: Path) -> Table:
     rows: list[list[typing.Any]] = []
     for run in folders:
         shop = Workshop(run, folder / "deformers" / run.parent.name)
-        for name, kind in LONG.items():
-            for method in (OURS, STILL, POSES, SKINNING):
-                work = functools.partial(shop.measured, method, (shop.long(name),))
-                (found,) = notebook.measured(f"{shop.name}, {method}, long {name[0]}", work)
-                row = {OURS: SMAD, STILL: "without velocity encoding"}.get(method)
-                printed = SMAD_5.at((row, kind), "PSNR").value if row else None
-                cells = [pooled([found], metric) for metric in ("PSNR", "LPIPS", "loose")]
-                rows.append([run.parent.name, kind, method, printed, *cells, growth(found["PSNR"])])
+        takes = {kind: (shop.long(name),) for name, kind in LONG.items()}
+        works = {m: functools.partial(shop.measured, m, takes) for m in (OURS, STILL, POSES, SKINNING)}
+        found = {m: notebook.measured(f"{shop.name}, {m}, long", work) for m, work in works.items()}
+        for kind, method in itertools.product(takes, works):
+            row = {OURS: SMAD, STILL: "without velocity encoding"}.get(method)
+            printed = SMAD_5.at((row, kind), "PSNR").value if row else None
+            cells = [pooled(found[method][kind], metric) for metric in ("PSNR", "LPIPS", "loose")]
+            rows.append([run.parent.name, kind, method, printed, *cells, growth(found[method][kind][0]["PSNR"])])
     return Table(
         "Long takes (SMAD Table 5)",
         f"{smad_motions.LONG} frames under the keyboard: keys that change (dynamic), one key held (repetitive); "
