@@ -145,6 +145,7 @@ def run(args: Args) -> Path:
         for part, names in all_of(MOTIONS.learning(max(args.motions))).items()
     }
     results: dict[int, Results] = {}
+    text = ""
     for count in args.motions:
         for name in wanted if count == args.motions[0] else (OURS,):
             for seed in range(args.seeds):
@@ -153,7 +154,8 @@ def run(args: Args) -> Path:
                     results.setdefault(count, {}).setdefault(method, []).append(found)
                 # A process may hold so many memory mappings, and each method compiles programs of its own.
                 jax.clear_caches()
-            report(args, config, results, folder)
+            text = report(args, config, results, folder)
+    print(text, flush=True)
     return folder
 
 
@@ -249,8 +251,8 @@ def twins(stage: Stage, chosen: np.ndarray, motions: Motions) -> Method:
     return method
 
 
-def report(args: Args, config: SmadConfig, results: dict[int, Results], folder: Path) -> None:
-    """Write dynamics.json, dynamics.md and plots, and print the tables; `results` by number of motions."""
+def report(args: Args, config: SmadConfig, results: dict[int, Results], folder: Path) -> str:
+    """Write dynamics.json, dynamics.md and plots; returns the tables. `results` by number of motions."""
     made_on = ", ".join(f"{key} {value}" for key, value in environment.describe().items())
     steps = config.dynamics.target_stage.steps, config.dynamics.stage.steps
     about = (
@@ -264,7 +266,7 @@ def report(args: Args, config: SmadConfig, results: dict[int, Results], folder: 
     smad_dynamics_tables.plots(folder, results[args.motions[0]], MOTIONS)
     atomic.write_text(folder / "dynamics.md", text)
     atomic.write_text(folder / "dynamics.json", json.dumps(results, indent=1))
-    print(text, flush=True)
+    return text
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -4,11 +4,13 @@ import math
 import typing
 
 import jax
+import numpy as np
 import pytest
 
 from avatarjax.metrics.published import UNICA_3
 from avatarjax.metrics.statistics import Estimate
 from experiments.tables import __main__ as tables
+from experiments.tables import deformers
 from experiments.tables.table import Notebook, Table, cell, ordering
 
 
@@ -66,3 +68,15 @@ def test_help_names_every_table(capsys):
     assert stopped.value.code == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert all(name in shown for name in typing.get_args(tables.Name))
+
+
+def test_only_pairs_of_deformers_that_are_told_apart_count_for_the_order():
+    rng = np.random.default_rng(0)
+    base = rng.normal(size=60)
+    worse = base - 1 + 0.05 * rng.normal(size=60)
+    found = {"ours": base, "MLP": worse, "vanilla GNN": worse + 0.05 * rng.normal(size=60)}
+    takes = {name: [{"PSNR": values.tolist()}] for name, values in found.items()}
+    # Printed, the GNN is ahead of ours and both of the MLP.
+    assert deformers.order(takes) == "of 3 pairs of methods 2 are told apart, 1 of these in the paper's order"
+    apart = deformers.less(takes["ours"], takes["MLP"], "PSNR")
+    assert apart.mean == pytest.approx(float((base - worse).mean())) and apart.groups == 10

@@ -178,7 +178,7 @@ def deformers(folders: list[Path], notebook: Notebook, folder: Path) -> Table:
             test = found[method]["test"]
             cells += [pooled(test, "LPIPS"), pooled(test, "loose"), less(found[OURS]["test"], test, "PSNR")]
             rows.append([run.parent.name, method, printed, *cells])
-        remarks.append(f"{run.parent.name}: {order({m: pooled(f['test'], 'PSNR') for m, f in found.items()})}")
+        remarks.append(f"{run.parent.name}: {order({m: f['test'] for m, f in found.items()})}")
     return Table(
         "How the deformer is built (SMAD Tables 2 and 4)",
         f"Learned from one video, drawn through rollouts for {LONGER} times the steps of the preset, all from the same "
@@ -243,12 +243,18 @@ def growth(values: list[float]) -> Estimate:
     return Estimate(slope, low, high, len(values))
 
 
-def order(found: dict[str, Estimate | None]) -> str:
-    """How many pairs of methods are in the order of the paper's PSNR."""
-    known = [(METHODS[m][1], value.mean) for m, value in found.items() if METHODS[m][1] is not None and value]
-    pairs = [(a, b) for a, b in itertools.combinations(known, 2) if a[0] != b[0]]
-    same = sum((a[0] > b[0]) == (a[1] > b[1]) for a, b in pairs)  # type: ignore[operator]
-    return f"of {len(pairs)} pairs of methods {same} are in the paper's order"
+def order(found: dict[str, list[Values]]) -> str:
+    """How many pairs of methods are told apart in PSNR, and how many of these are in the paper's order."""
+    pairs, told, same = 0, 0, 0
+    for first, second in itertools.combinations(found, 2):
+        printed = METHODS[first][1], METHODS[second][1]
+        if printed[0] is None or printed[1] is None or printed[0] == printed[1]:
+            continue
+        apart = less(found[first], found[second], "PSNR")
+        pairs += 1
+        if apart.low > 0 or apart.high < 0:
+            told, same = told + 1, same + ((printed[0] > printed[1]) == (apart.mean > 0))
+    return f"of {pairs} pairs of methods {told} are told apart, {same} of these in the paper's order"
 
 
 def _pieces(takes: list[Values], metric: str) -> np.ndarray:
