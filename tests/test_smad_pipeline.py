@@ -13,6 +13,7 @@ from avatarjax.data.motion import performances
 from avatarjax.smad import config as configs
 from avatarjax.smad import driving, refine
 from avatarjax.smad.config import DynamicsConfig, FilmConfig, PicturesConfig
+from avatarjax.smad.fusion import FusionConfig
 from avatarjax.smad.graph import GraphConfig
 from avatarjax.smad.radiance_field import FieldConfig
 from avatarjax.train import StageConfig
@@ -20,7 +21,7 @@ from experiments import smad as experiment
 from experiments import smad_measures as measures
 from experiments import smad_motions
 from experiments.tables import __main__ as tables
-from experiments.tables import deformers, initialisation
+from experiments.tables import deformers, fusion, initialisation
 
 CI = configs.preset("ci")
 FRAMES = 26
@@ -156,6 +157,21 @@ def test_deformers_are_compared_from_the_same_equilibrium(finished, capsys, monk
     assert "measuring" in capsys.readouterr().out
     (again,) = tables.run_tables(args)
     assert again.markdown() == long.markdown() and "measuring" not in capsys.readouterr().out
+
+
+def test_ways_to_colour_are_compared(finished, monkeypatch):
+    """Before anything is learned a view that is trusted fully changes pictures; own colours give the run's own."""
+    short = StageConfig(1, 1, 0.0)
+    methods = {fusion.OWN: FusionConfig(views=0, stage=short), "attention alone": FusionConfig(3, stage=short)}
+    monkeypatch.setattr(fusion, "METHODS", methods)
+    args = tables.Args(("fusion",), preset="ci", avatars=("ghostlady",), out=finished.parents[2])
+    (table,) = tables.run_tables(args)
+    run = json.loads((finished / "metrics.json").read_text())["test arcs-1"]
+    assert [row[2:4] for row in table.rows] == [[v, m] for v in (fusion.RECORDED, fusion.NOVEL) for m in methods]
+    for own, other in (table.rows[:2], table.rows[2:]):
+        views = "pictures" if own[2] == fusion.RECORDED else "novel views"
+        assert own[4].mean == pytest.approx(run[views]["ours"]["PSNR"]["mean"], abs=1e-3)
+        assert other[-1].mean == pytest.approx(other[4].mean - own[4].mean, abs=1e-4) and other[-1].mean != 0
 
 
 def test_a_second_run_reuses_and_a_stage_runs_anew(finished, capsys):

@@ -22,8 +22,8 @@ from experiments.tables.deformers import Values, Workshop, less, perceptual, poo
 from experiments.tables.table import Notebook, Table
 
 OWN = "its own"
-METHODS: dict[str, FusionConfig | None] = {
-    OWN: None,
+METHODS = {
+    OWN: FusionConfig(views=0),
     "confidence and attention": FusionConfig(),
     "confidence alone": FusionConfig(attention=False),
     "attention alone": FusionConfig(confidence=False),
@@ -70,23 +70,25 @@ def _measured(shop: Workshop, method: str) -> dict[str, dict[str, list[Values]]]
             moved = measures.move(avatar, driving.recorded(take.poses))["ours"]
             views = {RECORDED: [measures.recorded_view(take)], NOVEL: measures.novel_views(take, texture)}
             for name, several in views.items():
-                values: Values = {}
-                for view in several:
-                    seen = moved
-                    if config is not None and learned is not None:
-                        fuse = functools.partial(_fuse, config, *learned)
-                        seen = measures.Moved(functools.partial(_seen, fuse, moved, take, view), moved.nodes)
-                    for metric, known in measures.picture_values([view], {method: seen}, perceptual())[method].items():
-                        values.setdefault(metric, []).extend(known)
-                found[part][name].append(values)
+                each = [_values(config, learned, moved, take, view) for view in several]
+                # The views of one frame count together.
+                means = {metric: np.mean([values[metric] for values in each], axis=0).tolist() for metric in each[0]}
+                found[part][name].append(means)
     return found
 
 
-def _seen(fuse, moved: measures.Moved, take: MonocularVideo, view: measures.View, frame: int) -> Gaussians:
-    """The Gaussians of a frame as they look from the camera of a view."""
-    pose = jax.tree.map(lambda x: x[frame], driving.recorded(take.poses))
-    place = driving.to_body(pose, view.at(frame)[0].position[None])[0]
-    return fuse(moved.gaussians(frame), place / jnp.linalg.norm(place))
+def _values(config, learned, moved: measures.Moved, take: MonocularVideo, view: measures.View) -> Values:
+    """Of each measured frame of a view."""
+    poses = driving.recorded(take.poses)
+
+    def seen(frame: int) -> Gaussians:
+        if learned is None:
+            return moved.gaussians(frame)
+        pose = jax.tree.map(lambda x: x[frame], poses)
+        place = driving.to_body(pose, view.at(frame)[0].position[None])[0]
+        return _fuse(config, *learned, moved.gaussians(frame), place / jnp.linalg.norm(place))
+
+    return measures.picture_values([view], {OWN: measures.Moved(seen, moved.nodes)}, perceptual())[OWN]
 
 
 @functools.partial(jax.jit, static_argnames="config")

@@ -32,8 +32,8 @@ from avatarjax.train import StageConfig
 
 @dataclasses.dataclass(frozen=True)
 class FusionConfig:
-    """So many `views` are kept, the confidence falls off with rho, queries and keys have `width` numbers. `confidence`
-    and `attention` may be left out. All numbers are ours."""
+    """So many `views` are kept (0: colours are learned without), the confidence falls off with rho, queries and keys
+    have `width` numbers. `confidence` and `attention` may be left out. All numbers are ours."""
 
     views: int = 24
     rho: float = 0.05
@@ -43,8 +43,8 @@ class FusionConfig:
     stage: StageConfig = StageConfig(1_500, 2, 5e-3)
 
     def __post_init__(self):
-        if self.rho <= 0 or self.views < 1 or self.width < 1:
-            raise ValueError(f"rho {self.rho}, views {self.views} and width {self.width} must be positive")
+        if self.rho <= 0 or self.views < 0 or self.width < 1:
+            raise ValueError(f"rho {self.rho} and width {self.width} must be positive, views {self.views} not negative")
 
 
 @typing.no_type_check

@@ -103,16 +103,16 @@ def train_swing(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
 
 
 def train_fusion(
-    avatar: Avatar, takes: Footage, config: FusionConfig | None, run: Run
+    avatar: Avatar, takes: Footage, config: FusionConfig, run: Run
 ) -> tuple[Avatar, tuple[Params, Views] | None]:
     """The avatar with colours that were learned on at its equilibrium, all else held, and beside them parameters and
-    views of the fusion (`fusion.fuse`) that were learned with them, for the same steps; None leaves that out."""
-    stage = (config or FusionConfig()).stage
+    views of the fusion (`fusion.fuse`) that were learned with them; None where `config` wants no views."""
+    stage = config.stage
     recorded, splat = _recorded(avatar, takes), _room(avatar, takes)
     frames = np.flatnonzero(~takes.held_out)
     start = {"colors": refine.encode(avatar.gaussians)["colors"]}
     views = None
-    if config is not None:
+    if config.views:
         views = views_of(avatar, takes, config.views)
         start["fusion"] = fusion.init(config, run.key("fusion"))
 
@@ -128,7 +128,7 @@ def train_fusion(
         def missed(shot):
             frame, camera, rgba = shot
             cloud = _carried(dressed, batch["recorded"], frame)
-            if config is not None:
+            if config.views:
                 cloud = fusion.fuse(config, params["fusion"], batch["seen"], cloud, fusion.direction(camera))
             return l1(render(cloud, camera, background=background, config=splat).image, footage.over(rgba, background))
 
