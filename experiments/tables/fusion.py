@@ -40,7 +40,7 @@ def fusion(folders: list[Path], notebook: Notebook, folder: Path) -> Table:
         shop = Workshop(run, folder / "fusion" / run.parent.name)
         found = {m: notebook.measured(f"{shop.name}, {m}", functools.partial(_measured, shop, m)) for m in METHODS}
         for part, view in itertools.product(PARTS, (RECORDED, NOVEL)):
-            if not found[OWN].get(part):
+            if not found[OWN][part][view]:
                 continue
             for method in METHODS:
                 takes, own = found[method][part][view], found[OWN][part][view]
