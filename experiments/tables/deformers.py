@@ -29,12 +29,11 @@ from experiments import smad as experiment
 from experiments import smad_measures as measures
 from experiments import smad_motions
 from experiments.smad_dynamics import LEARNED, net
-from experiments.smad_dynamics_tables import OURS
+from experiments.smad_dynamics_tables import OURS, POSES, SKINNING
 from experiments.tables.table import Notebook, Table
 
 PARTS = ("train", "test", "unseen")
-SKINNING, POSES, CODES = "skinning", "pose window alone", "without latent codes"
-STILL = "B0 no velocities"
+CODES, STILL = "without latent codes", "B0 no velocities"
 # By name how a method differs from ours, and the paper's row with its printed PSNR; without a change it needs no
 # training of its own.
 METHODS: dict[str, tuple[Callable[[SmadConfig], SmadConfig] | None, float | None]] = {
