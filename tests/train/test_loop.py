@@ -80,6 +80,16 @@ def test_a_checkpoint_of_something_else_is_ignored(step, tmp_path):
     assert [r["step"] for r in read_metrics(tmp_path / "run.jsonl")] == list(range(1, STEPS + 1))
 
 
+def test_a_checkpoint_of_another_optimiser_is_ignored(step, tmp_path):
+    """Its state is of other arrays, which could not be gone on with."""
+    plain = optax.sgd(0.1)
+    begin = new_state({"w": jnp.zeros(3)}, plain, jax.random.key(5))
+    fit(make_step(noisy, plain), begin, batch_at, 2, tmp_path, "run", fingerprint="a")
+    seen = []
+    fit(step, fresh(), lambda k: seen.append(k) or batch_at(k), STEPS, tmp_path, "run", fingerprint="a")
+    assert seen == list(range(STEPS))
+
+
 def test_a_truncated_checkpoint_is_named(step, tmp_path):
     fit(step, fresh(), batch_at, 2, tmp_path, "run")
     path = tmp_path / "run.safetensors"

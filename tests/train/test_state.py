@@ -5,7 +5,7 @@ import optax
 import pytest
 
 from avatarjax.train import make_step, new_state, weights
-from avatarjax.train.state import optimiser
+from avatarjax.train.state import SMALL, optimiser, packed, together, unpacked
 
 
 def quadratic(params, key, batch):
@@ -75,6 +75,36 @@ def test_a_gradient_that_is_not_finite_changes_nothing_and_is_counted(key):
     state, metrics = step(state, TARGET)
     assert float(metrics["skipped"]) == 0
     assert not np.array_equal(state.params["w"], before[0]["w"])
+
+
+def mixed():
+    """A tree of small leaves, one without axes and one of other numbers, and a large one."""
+    rng = np.random.default_rng(0)
+    small = {"b": jnp.asarray(rng.normal(size=(3, 4)), jnp.float32), "a": jnp.float32(2.5)}
+    return {"small": small, "large": jnp.asarray(rng.normal(size=SMALL + 1), jnp.float32), "half": jnp.ones(2, "half")}
+
+
+def test_small_leaves_are_one_vector_and_come_back():
+    tree = mixed()
+    parts = packed(tree)
+    assert [x.shape for x in parts] == [(SMALL + 1,), (15,)]
+    back = unpacked(parts, tree)
+    jax.tree.map(np.testing.assert_array_equal, back, tree)
+    assert [x.dtype for x in jax.tree.leaves(back)] == [x.dtype for x in jax.tree.leaves(tree)]
+    for one in ({"large": tree["large"]}, tree["small"]):
+        jax.tree.map(np.testing.assert_array_equal, unpacked(packed(one), one), one)
+
+
+def test_optimised_together_every_leaf_moves_as_alone():
+    """Also with what needs the norm of all, and the parameters themselves."""
+    plain = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(0.1))
+    params = {k: v for k, v in mixed().items() if k != "half"}
+    gradient = jax.tree.map(lambda x: x**2 + 1, params)
+    ways = [(t, t.init(params)) for t in (plain, together(plain))]
+    for _ in range(3):
+        moves, states = zip(*(t.update(gradient, state, params) for t, state in ways), strict=True)
+        ways = [(t, state) for (t, _), state in zip(ways, states, strict=True)]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), *moves)
 
 
 def test_the_state_is_donated(key, step):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import time
@@ -33,14 +34,16 @@ def fit(
 
     `batch_at(k)` gives the batch of step k from k alone, so that a run which was interrupted goes on as if it had not
     been. State is saved to `folder/name.safetensors` twice a minute and at the end; a file that is there is resumed if
-    its `fingerprint` (of configuration and data) is this one, and ignored otherwise. Means over about `log_points`
-    intervals go to `folder/name.jsonl`, with the seconds since the run began and the processor time, of all cores
-    together, since this process took it up. Raises FloatingPointError when every step of an interval was skipped
-    because its gradient was not finite.
+    its `fingerprint` (of configuration and data) and the arrays of its state are these, and ignored otherwise. Means
+    over about `log_points` intervals go to `folder/name.jsonl`, with the seconds since the run began and the processor
+    time, of all cores together, since this process took it up. Raises FloatingPointError when every step of an interval
+    was skipped because its gradient was not finite.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint, log = folder / f"{name}.safetensors", folder / f"{name}.jsonl"
+    arrays = [(x.shape, str(x.dtype)) for x in jax.tree.leaves(state)]
+    fingerprint = hashlib.sha256(f"{fingerprint} {arrays}".encode()).hexdigest()[:12]
     state, seconds = _resume(checkpoint, state, fingerprint)
     start = int(state.step)
     if start >= steps:
