@@ -26,7 +26,7 @@ jax.config.update("jax_num_cpu_devices", 2)
 # and its worker processes, which inherit the environment, share them.
 _cache = tempfile.TemporaryDirectory(prefix="avatarjax-tests-", ignore_cleanup_errors=True)
 jax.config.update("jax_compilation_cache_dir", os.environ.setdefault("AVATARJAX_TEST_CACHE", _cache.name))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def pytest_collection_modifyitems(items):
