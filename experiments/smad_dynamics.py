@@ -38,12 +38,13 @@ from experiments import smad_dynamics_measures as measures
 from experiments.smad_dynamics_measures import Found, Method
 from experiments.smad_dynamics_tables import (
     DAMPING,
+    DRAPE,
+    EQUILIBRIUM,
     ISOMETRY,
     KERNEL,
     LENGTH,
     MEAN,
     OURS,
-    POSES,
     RIDGE,
     SKINNING,
     SPACE,
@@ -53,7 +54,7 @@ from experiments.smad_dynamics_tables import (
 from experiments.smad_motions import Motions, Name, Stage, all_of, on_nodes
 
 MOTIONS = Motions()
-MEASURES = 3  # which version of the measures: kept ones of another are taken anew
+MEASURES = 4  # which version of the measures: kept ones of another are taken anew
 
 
 def net(config: SmadConfig, **changes: typing.Any) -> SmadConfig:
@@ -61,7 +62,7 @@ def net(config: SmadConfig, **changes: typing.Any) -> SmadConfig:
     return dataclasses.replace(config, deformer=dataclasses.replace(config.deformer, **changes))
 
 
-def _losses(config: SmadConfig, **changes: typing.Any) -> SmadConfig:
+def _dynamics(config: SmadConfig, **changes: typing.Any) -> SmadConfig:
     return dataclasses.replace(config, dynamics=dataclasses.replace(config.dynamics, **changes))
 
 
@@ -72,7 +73,7 @@ def _nodes(config: SmadConfig, times: float) -> SmadConfig:
 def _longer(config: SmadConfig, times: float) -> SmadConfig:
     stages = {name: getattr(config.dynamics, name) for name in ("target_stage", "stage")}
     counts = {name: max(1, round(times * stage.steps)) for name, stage in stages.items()}
-    return _losses(config, **{name: dataclasses.replace(stages[name], steps=n) for name, n in counts.items()})
+    return _dynamics(config, **{name: dataclasses.replace(stages[name], steps=n) for name, n in counts.items()})
 
 
 def _regular(config: SmadConfig) -> SmadConfig:
@@ -84,7 +85,7 @@ def _regular(config: SmadConfig) -> SmadConfig:
 def _free(config: SmadConfig) -> SmadConfig:
     """Without the terms of Eq. 11."""
     pictures = dataclasses.replace(config.pictures, isometry=0.0)
-    return dataclasses.replace(_losses(config, isometry=0.0, damping=0.0), pictures=pictures)
+    return dataclasses.replace(_dynamics(config, isometry=0.0, damping=0.0), pictures=pictures)
 
 
 def _edges(config: SmadConfig) -> SmadConfig:
@@ -107,9 +108,10 @@ LEARNED: dict[str, Callable[[SmadConfig], SmadConfig]] = {
     "B3 tau_v = 15": lambda c: net(c, velocities=16),
     "C1 half the nodes": lambda c: _nodes(c, 0.5),
     "C3 twice the nodes": lambda c: _nodes(c, 2.0),
-    "equilibrium of the network alone": lambda c: _losses(c, components=0),
-    **{f"{ISOMETRY}{w:g}": lambda c, w=w: _losses(c, isometry=w) for w in (0.0, 0.01, 0.1, 1.0)},
-    **{f"{DAMPING}{w:g}": lambda c, w=w: _losses(c, damping=w) for w in (0.0, 0.01, 0.1, 1.0)},
+    "without memory": lambda c: _dynamics(c, memory=0),
+    "equilibrium of the network alone": lambda c: _dynamics(c, components=0),
+    **{f"{ISOMETRY}{w:g}": lambda c, w=w: _dynamics(c, isometry=w) for w in (0.0, 0.01, 0.1, 1.0)},
+    **{f"{DAMPING}{w:g}": lambda c, w=w: _dynamics(c, damping=w) for w in (0.0, 0.01, 0.1, 1.0)},
     **{f"{times:g}{LENGTH}": lambda c, times=times: _longer(c, times) for times in (0.1, 0.3, 3.0)},
 }
 
@@ -233,10 +235,13 @@ def yardsticks(config: SmadConfig, params: typing.Any, system: System, recorded:
     methods = {label: measures.of_linear(config, model, system) for label, model in models.items()}
     # The equilibrium from which the network has not departed is the drape.
     drape = params | {"target": 0 * params["target"]}
+    windows = _dynamics(config, memory=0)
+    forgetful = system.replace(drape=train_dynamics.fit_drape(windows, recorded))
     return methods | {
-        KERNEL: measures.of_equilibrium(config, drape, system),
+        KERNEL: measures.of_equilibrium(windows, drape, forgetful),
+        DRAPE: measures.of_equilibrium(config, drape, system),
         SKINNING: measures.of_skinning(system),
-        POSES: measures.of_equilibrium(config, params, system),
+        EQUILIBRIUM: measures.of_equilibrium(config, params, system),
     }
 
 

@@ -18,17 +18,18 @@ from experiments.smad_motions import Motions
 from experiments.tables.table import Table
 
 PARTS = ("train", "test", "unseen")
-TWINS, SKINNING, MEAN, RIDGE, SPACE, KERNEL, POSES, OURS = (
+TWINS, SKINNING, MEAN, RIDGE, SPACE, KERNEL, DRAPE, EQUILIBRIUM, OURS = (
     "twins",
     "skinning",
     "mean drape",
     "ridge regression",
     "linear state space",
     "kernel ridge regression",
-    "pose window alone",
+    "our drape alone",
+    "equilibrium alone",
     "ours",
 )
-YARDSTICKS = (SKINNING, MEAN, RIDGE, SPACE, KERNEL, POSES)
+YARDSTICKS = (SKINNING, MEAN, RIDGE, SPACE, KERNEL, DRAPE, EQUILIBRIUM)
 # What a method of another loss weight, or of another length of training, is called; they are numbers of the preset's.
 ISOMETRY, DAMPING, LENGTH = "isometry ", "damping ", " times the steps"
 TOLD = 0.05  # p below which two methods are told apart
@@ -69,14 +70,14 @@ def data_table(results: dict[int, Results]) -> Table:
     rows = []
     for count in sorted(results):
         found = results[count]
-        cells = [across(found[name], "test", "loose") for name in (MEAN, RIDGE, SPACE, KERNEL, POSES, OURS)]
+        cells = [across(found[name], "test", "loose") for name in (*YARDSTICKS[1:], OURS)]
         unseen = [across(found[name], "unseen", "loose") for name in (RIDGE, OURS)]
         rows.append([count, *cells, compared(found[OURS], found[RIDGE], "test"), *unseen])
     return Table(
         "How much motion it is learned from",
         "Loose nodes, mm; the same motions of the test throughout, the learned methods trained for the same steps. p: "
         "ours against ridge regression.",
-        ["motions", MEAN, RIDGE, SPACE, KERNEL, POSES, OURS, "p", f"unseen, {RIDGE}", f"unseen, {OURS}"],
+        ["motions", *YARDSTICKS[1:], OURS, "p", f"unseen, {RIDGE}", f"unseen, {OURS}"],
         rows,
     )
 

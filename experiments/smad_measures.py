@@ -49,7 +49,7 @@ def move(avatar: smad.Avatar, poses: Pose) -> dict[str, Moved]:
     _, frames = _rollout(avatar, state, after)
     driven, settled = dynamics.without_swing(avatar.config, avatar.params, avatar.system, poses)
     found = {"ours": Moved(lambda k: jax.tree.map(lambda x: x[k - 1], frames.gaussians), np.asarray(frames.nodes))}
-    for name, nodes in (("pose window alone", settled[1:]), ("skinning", driven[1:])):
+    for name, nodes in (("equilibrium alone", settled[1:]), ("skinning", driven[1:])):
         dressed = functools.partial(_dressed, avatar, nodes, after)
         found[name] = Moved(dressed, np.asarray(nodes))
     return found

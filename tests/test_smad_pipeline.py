@@ -67,7 +67,7 @@ def test_everything_that_is_promised_is_written(finished):
     for views in ("pictures", "novel views"):
         assert all(0 < kinds["PSNR"]["mean"] < 50 for kinds in found["test arcs-1"][views].values())
     errors = found["test arcs-1"]["nodes"]["all nodes"]
-    assert set(errors) == {"ours", "pose window alone", "skinning"}
+    assert set(errors) == {"ours", "equilibrium alone", "skinning"}
     assert all(0 < error["mean"] < 500 for error in errors.values())
 
 
@@ -130,7 +130,7 @@ def test_deformers_are_compared_from_the_same_equilibrium(finished, capsys, monk
     monkeypatch.setattr(deformers, "METHODS", some | {"ours": deformers.METHODS["MLP"]})
     monkeypatch.setattr(deformers, "LONG", {("arcs", 2): "dynamic pose"})
     monkeypatch.setattr(deformers, "STILL", "ours")
-    monkeypatch.setattr(deformers, "POSES", "skinning")
+    monkeypatch.setattr(deformers, "EQUILIBRIUM", "skinning")
     monkeypatch.setattr(smad_motions, "perform", lambda rig, name: jax.device_get(performances.perform(rig, *name)))
     monkeypatch.setattr(jax, "clear_caches", lambda: None)
     args = tables.Args(("deformers",), preset="ci", avatars=("ghostlady",), out=finished.parents[2])

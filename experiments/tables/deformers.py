@@ -29,7 +29,7 @@ from experiments import smad as experiment
 from experiments import smad_measures as measures
 from experiments import smad_motions
 from experiments.smad_dynamics import LEARNED, net
-from experiments.smad_dynamics_tables import OURS, POSES, SKINNING
+from experiments.smad_dynamics_tables import EQUILIBRIUM, OURS, SKINNING
 from experiments.tables.table import Notebook, Table
 
 PARTS = ("train", "test", "unseen")
@@ -47,7 +47,7 @@ METHODS: dict[str, tuple[Callable[[SmadConfig], SmadConfig] | None, float | None
     # The paper's C3 has two and a half times its nodes.
     "C3 twice the nodes": (LEARNED["C3 twice the nodes"], SMAD_2.at("C3", "PSNR").value),
     SKINNING: (None, SMAD_2.at("C0", "PSNR").value),
-    POSES: (None, None),
+    EQUILIBRIUM: (None, None),
 }
 # The long sequences of Table 5, and what the paper calls them.
 LONG = {("keys", 0): "dynamic pose", ("run", 0): "repetitive pose"}
@@ -205,7 +205,7 @@ def long_takes(folders: list[Path], notebook: Notebook, folder: Path) -> Table:
     for run in folders:
         shop = Workshop(run, folder / "deformers" / run.parent.name)
         takes = {kind: (shop.long(name),) for name, kind in LONG.items()}
-        works = {m: functools.partial(shop.measured, m, takes) for m in (OURS, STILL, POSES, SKINNING)}
+        works = {m: functools.partial(shop.measured, m, takes) for m in (OURS, STILL, EQUILIBRIUM, SKINNING)}
         found = {m: notebook.measured(f"{shop.name}, {m}, long", work) for m, work in works.items()}
         for kind, method in itertools.product(takes, works):
             row = {OURS: SMAD, STILL: "without velocity encoding"}.get(method)

@@ -12,7 +12,7 @@ from avatarjax.metrics import published
 from avatarjax.metrics.statistics import Estimate, bootstrap, paired_t_test
 from experiments.tables.table import Table, ordering
 
-OURS, METHODS = "ours", ("ours", "pose window alone", "skinning")
+OURS, METHODS = "ours", ("ours", "equilibrium alone", "skinning")
 PARTS = {"train": "learned from", "test": "another seed", "unseen": "unseen kind"}
 METRICS = ("PSNR", "SSIM", "LPIPS")
 VIEWS = {"pictures": "", "novel views": ", new views"}
@@ -65,7 +65,7 @@ def monocular(folders: list[Path]) -> Table:
     return Table(
         "From one video (SMAD Tables 1, 3 and I)",
         "Each avatar learned from a slow turn and moving takes of one camera; pictures over black, one frame of five "
-        "of each take, rollouts from rest. Skinning is linear blend skinning of the same Gaussians, pose window alone "
+        "of each take, rollouts from rest. Skinning is linear blend skinning of the same Gaussians, equilibrium alone "
         "the equilibrium without swing. New views are cameras beside and behind. Loose nodes: mean distance in mm to "
         "where they truly are. The paper's subjects are others: its rows are landmarks.",
         ["avatar", "motion", "method", *(f"{metric}{VIEWS[view]}" for view, metric in columns), "loose nodes, mm"],

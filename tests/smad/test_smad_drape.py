@@ -35,7 +35,10 @@ def windows(features, first=None):
 
 
 def lie(found, poses):
-    return jax.vmap(lambda window: drape.offsets(found, window))(jnp.asarray(poses, jnp.float32))
+    """The offsets under each window, whatever was before."""
+    before = jnp.zeros(len(found.basis))
+    at = jax.vmap(lambda window: drape.offsets(found, drape.components(found, window, before)))
+    return at(jnp.asarray(poses, jnp.float32))
 
 
 def test_with_every_window_a_centre_it_is_kernel_ridge_regression(takes):
@@ -60,9 +63,67 @@ def test_it_bends_where_linear_regression_cannot(takes):
 
 def test_far_from_what_it_knows_it_is_the_mean_drape(takes):
     found = fit(takes, centres=100)
-    np.testing.assert_allclose(drape.offsets(found, jnp.full((WINDOW, 2), 50.0)), found.mean, atol=1e-7)
+    np.testing.assert_allclose(lie(found, jnp.full((1, WINDOW, 2), 50.0))[0], found.mean, atol=1e-7)
 
 
 def test_more_components_than_frames_are_refused(takes):
     with pytest.raises(ValueError, match="3 components need as many frames, there are 2"):
         fit([x[:2] for x in takes])
+
+
+LAG = 6
+
+
+def trailing(seed, frames=FRAMES):
+    """A feature that jumps from time to time, and two nodes that follow it more slowly than a window is long: what a
+    window says of them is not enough."""
+    rng = np.random.default_rng(seed)
+    push = np.repeat(rng.uniform(-1, 1, frames // 12), 12)
+    place = np.full(frames, push[0])
+    for k in range(1, frames):
+        place[k] = place[k - 1] + 0.06 * (push[k] - place[k - 1])
+    return push[:, None], 0.1 * place[:, None, None] * np.ones((1, 2, 3))
+
+
+def roll(found, poses):
+    """Offsets in every frame of a take, begun at rest under its first window."""
+    poses = jnp.asarray(poses, jnp.float32)
+
+    def at(memory, window):
+        now = drape.components(found, window, memory[-1])
+        return jnp.concatenate([now[None], memory[:-1]]), drape.offsets(found, now)
+
+    return jax.lax.scan(at, jnp.repeat(drape.at_rest(found, poses[0])[None], LAG, axis=0), poses)[1]
+
+
+def test_with_a_memory_what_comes_late_is_followed_from_rest():
+    parts = [trailing(seed) for seed in range(20)]
+    features, offsets = (jnp.asarray(np.concatenate(x)) for x in zip(*parts, strict=True))
+    learned = offsets, features, jnp.repeat(jnp.arange(20) * FRAMES, FRAMES)
+    features, truth = trailing(99)
+    errors = {}
+    for memory in (0, LAG):
+        options = {"components": 1, "window": WINDOW, "stride": STRIDE, "ridge": 0.01, "memory": memory}
+        found = drape.fit(*learned, **options)
+        assert (found.past is None) == (memory == 0)
+        errors[memory] = np.abs(np.asarray(roll(found, windows(features))) - truth).mean()
+    assert errors[LAG] < 0.3 * errors[0]
+
+
+def test_a_memory_counts_as_a_window_does(takes):
+    """Under the same window the nearer the past is to a centre's, the more that centre counts; far from all of them
+    cloth lies as in the mean."""
+    found = fit(takes, centres=50, memory=LAG)
+    window, past = jnp.zeros((WINDOW, 2)), found.past[3]
+    near = kernel.near(found.kernel, window)
+    apart = np.sum((np.asarray(found.past) - np.asarray(past)) ** 2, axis=1)
+    expected = (np.asarray(near) * np.exp(-apart / float(found.reach))) @ np.asarray(found.weights)
+    np.testing.assert_allclose(drape.components(found, window, past), expected, atol=1e-5)
+    np.testing.assert_allclose(drape.components(found, window, past + 50.0), 0.0, atol=1e-7)
+
+
+def test_at_rest_it_stays(takes):
+    found = fit(takes, centres=100, memory=LAG)
+    window = jnp.asarray(windows(np.asarray(takes[1], np.float64)[:FRAMES])[0], jnp.float32)
+    rest = drape.at_rest(found, window)
+    np.testing.assert_allclose(drape.components(found, window, rest), rest, atol=1e-4)

@@ -101,8 +101,9 @@ class DynamicsConfig:
     """How the dynamics are learned from tracks; from those of videos the equilibrium alone, and the rest from pictures
     (`PicturesConfig`). All is ours.
 
-    components: of the offsets, whose kernel ridge regression from the pose window (with so much `ridge` and so many
-    `centres`, `drape.fit`) is the drape that the equilibrium departs from; 0: none.
+    components: of the offsets, whose kernel ridge regression from the pose window and from how they were `memory`
+    frames before (0: from the window alone; with so much `ridge` and so many `centres`, `drape.fit`) is the drape that
+    the equilibrium departs from; 0: none.
     target_stage: of what poses alone say of the offsets, which needs no rollouts, in frames; stage: of all else, in
     rollouts of so many `frames`. noise: of the offsets from which rollouts start, in units of the
     offsets' spread, constant over the history. isometry, damping: weights of Eq. 11, means over edges and nodes.
@@ -112,8 +113,9 @@ class DynamicsConfig:
     """
 
     components: int = 48
-    ridge: float = 0.1
-    centres: int = 1_000
+    memory: int = 8
+    ridge: float = 0.03
+    centres: int = 3_000
     frames: int = 12
     noise: float = 0.05
     isometry: float = 0.001

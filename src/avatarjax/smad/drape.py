@@ -1,12 +1,15 @@
 """How cloth lies under a window of poses, in closed form: the drape that the learned equilibrium departs from.
 
-Kernel ridge regression of the offsets' principal components c from windows x of poses (`kernel`),
+Kernel ridge regression of the offsets' principal components c from windows x of poses (`kernel`) and, with a memory,
+from how the cloth lay l frames before,
 
-    c(x) = sum_m w_m near_m(x)
+    c_t = sum_m w_m near_m(x_t) exp(-|c_{t-l} - p_m|^2 / reach)
 
-with the Nyström method (Williams & Seeger 2001, "Using the Nyström Method to Speed Up Kernel Machines"). It bends where
-linear regression cannot, and far from all that it was learned from it falls back on the mean drape, where linear
-regression goes on.
+where p_m is how it lay l frames before centre m: a dynamical system that is learned without a gradient. It answers to
+itself only every l frames, so that its errors are not carried on thirty times a second (docs/smad.md). Solved with the
+Nyström method (Williams & Seeger 2001, "Using the Nyström Method to Speed Up Kernel Machines"). It bends where linear
+regression cannot, and far from all that it was learned from it falls back on the mean drape, where linear regression
+goes on.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from __future__ import annotations
 import typing
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
@@ -24,17 +28,22 @@ from avatarjax.smad.kernel import Kernel
 
 # Of the kernel's own variance, 1: what keeps its factor real in double precision.
 _JITTER = 1e-8
+# How often a drape is asked what follows itself until it is taken to be at rest.
+_RESTING = 50
 
 
 @typing.no_type_check
 @flax.struct.dataclass
 class Drape:
-    """The mean offset (n, 3), components (c, n, 3) of it, and the kernel whose m values have weights (m, c)."""
+    """The mean offset (n, 3), components (c, n, 3) of it, and the kernel whose m values have weights (m, c); with a
+    memory also how cloth lay before each centre, past (m, c), and the width () of the kernel of that."""
 
     mean: Float[Array, "n 3"]
     basis: Float[Array, "c n 3"]
     kernel: Kernel
     weights: Float[Array, "m c"]
+    past: Float[Array, "m c"] | None = None
+    reach: Float[Array, ""] | None = None
 
 
 def fit(
@@ -45,32 +54,55 @@ def fit(
     components: int = 48,
     window: int = 8,
     stride: int = 2,
+    memory: int = 0,
     ridge: float = 0.1,
     centres: int = 1000,
     seed: int = 0,
 ) -> Drape:
     """The drape of f frames of takes one after the other: offsets, and what `kernel.fit` takes.
 
-    components: at most as many as there are frames. ridge: the variance of what windows do not say, as a share of that
-    of what they say. Raises ValueError for fewer frames than components.
+    components: at most as many as there are frames. memory: how many frames before the cloth's own place counts too;
+    0: not at all. ridge: the variance of what windows do not say, as a share of that of what they say. Raises
+    ValueError for fewer frames than components.
     """
     mean, basis, wanted = linear.principal(offsets, components)
     fitted = kernel.fit(features, first, window=window, stride=stride, centres=centres, seed=seed)
-    x, projection, middle = (np.asarray(each, np.float64) for each in (fitted.mean, fitted.projection, fitted.centres))
-    points = (kernel.windows(features, first, window, stride) - x) @ projection
+    x, projection = (np.asarray(each, np.float64) for each in (fitted.mean, fitted.projection))
+    inputs = [(kernel.windows(features, first, window, stride) - x) @ projection / np.sqrt(float(fitted.width))]
+    some, past, reach = kernel.chosen(len(wanted), centres, seed), None, None
+    if memory:
+        before, reach = wanted[np.maximum(np.arange(len(wanted)) - memory, first)], kernel.reach(wanted)
+        inputs, past = [*inputs, before / np.sqrt(reach)], before[some]
+    points = np.concatenate(inputs, axis=1)
+    middle = points[some]
 
     def near(a, b):
         apart = np.sum(a**2, axis=1)[:, None] + np.sum(b**2, axis=1) - 2 * a @ b.T
-        return np.exp(-np.maximum(apart, 0) / float(fitted.width))
+        return np.exp(-np.maximum(apart, 0))
 
     factor = np.linalg.cholesky(near(middle, middle) + _JITTER * np.eye(len(middle)))
     design = scipy.linalg.solve_triangular(factor, near(middle, points), lower=True).T
     found = np.linalg.solve(design.T @ design + ridge * np.eye(len(middle)), design.T @ wanted)
     weights = scipy.linalg.solve_triangular(factor.T, found)
-    mean, basis, weights = (jnp.asarray(part, jnp.float32) for part in (mean, basis, weights))
-    return Drape(mean, basis, fitted, weights)
+    arrays = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), (mean, basis, weights, past, reach))
+    return Drape(*arrays[:2], fitted, *arrays[2:])
 
 
-def offsets(drape: Drape, window: Float[Array, "w p"]) -> Float[Array, "n 3"]:
-    """The offsets under one window of poses, newest first, metres."""
-    return drape.mean + jnp.tensordot(kernel.near(drape.kernel, window) @ drape.weights, drape.basis, 1)
+def components(drape: Drape, window: Float[Array, "w p"], before: Float[Array, "c"]) -> Float[Array, "c"]:
+    """How cloth lies under one window of poses, newest first, as components of the drape; `before` is how it lay as
+    many frames before as the drape remembers, and nothing to one without a memory."""
+    near = kernel.near(drape.kernel, window)
+    if drape.past is not None:
+        near = near * jnp.exp(-jnp.sum((drape.past - before[None]) ** 2, axis=1) / drape.reach)
+    return near @ drape.weights
+
+
+def at_rest(drape: Drape, window: Float[Array, "w p"]) -> Float[Array, "c"]:
+    """How cloth lies, as components, where the window has been the same for long."""
+    begin = jnp.zeros(len(drape.basis))
+    return jax.lax.fori_loop(0, _RESTING, lambda _, before: components(drape, window, before), begin)
+
+
+def offsets(drape: Drape, found: Float[Array, "c"]) -> Float[Array, "n 3"]:
+    """The offsets of such components, metres."""
+    return drape.mean + jnp.tensordot(found, drape.basis, 1)

@@ -1,7 +1,7 @@
 """How the nodes move: masses on springs and dampers, driven by poses, with a learned acceleration (SMAD 3.2).
 
 A node's place is that of the driven surface plus an offset o = t + r, both in the body frame: t is the equilibrium
-that a window of poses alone determines, and the swing r about it is that of masses on springs:
+under a window of poses, and the swing r about it is that of masses on springs:
 
     r'' = - k_i r_i - g_i r'_i - sum_j k_ij (r_i - r_j) - m_i s''_i + f_i
 
@@ -23,7 +23,7 @@ import typing
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from avatarjax.nets.functional import Params
 from avatarjax.physics import mass_spring_damper as msd
@@ -70,7 +70,7 @@ class Known:
 @typing.no_type_check
 @flax.struct.dataclass
 class System:
-    """What dynamics are learned for: the graph, what drives its nodes, scaling, the drape of a window of poses in
+    """What dynamics are learned for: the graph, what drives its nodes, scaling, the drape under a window of poses in
     closed form, from which the learned equilibrium departs (none: from no offset), and what that is known of (none:
     it is trusted everywhere).
 
@@ -89,7 +89,8 @@ class System:
 class State:
     """offset (n, 3) of each node from the driven surface in the body frame, metres; velocities (n, v, 3) of it, newest
     first, metres a second, v at least 1; equilibrium (2, n, 3) of the offset and driven (2, n, 3) the driven surface in
-    the world, newest first; window (w, p) normalised pose features, newest first; the last pose."""
+    the world, newest first; window (w, p) normalised pose features, newest first; the last pose; draped (l, c)
+    components of the drape in as many frames as it remembers, at least one, newest first; None without a drape."""
 
     offset: Float[Array, "n 3"]
     velocities: Float[Array, "n v 3"]
@@ -97,6 +98,7 @@ class State:
     driven: Float[Array, "2 n 3"]
     window: Float[Array, "w p"]
     pose: Pose
+    draped: Float[Array, "l c"] | None = None
 
 
 def sized(config: SmadConfig, joints: int) -> SmadConfig:
@@ -153,10 +155,16 @@ def pose_features(config: SmadConfig, system: System, poses: Pose) -> Float[Arra
     return (driving.track(poses, config.dt) - system.scaling.pose_mean[None]) / system.scaling.pose_scale[None]
 
 
-def settled(config: SmadConfig, params: Params, system: System, window: Float[Array, "w p"]) -> Float[Array, "n 3"]:
-    """The offset that a window of poses alone determines: the drape, and a linear reading of the network's own
-    embedding of the window. The less the window is like any that were learned from, the nearer that is drawn to the
-    mean embedding, as a network goes on where nothing tells it to."""
+def settled(
+    config: SmadConfig,
+    params: Params,
+    system: System,
+    window: Float[Array, "w p"],
+    draped: Float[Array, "c"] | None = None,
+) -> Float[Array, "n 3"]:
+    """The equilibrium of the offset under a window of poses: the drape, whose components are `draped`, and a linear
+    reading of the network's own embedding of the window. The less the window is like any that were learned from, the
+    nearer that is drawn to the mean embedding, as a network goes on where nothing tells it to."""
     if not config.equilibrium:
         return jnp.zeros(params["target"].shape[1:])
     window = window[:: config.deformer.pose_stride]
@@ -165,23 +173,55 @@ def settled(config: SmadConfig, params: Params, system: System, window: Float[Ar
         usual, trust = system.known.embedding, jnp.max(kernel.near(system.known.kernel, window))
         embedding = usual + trust * (embedding - usual)
     learned = jnp.tensordot(embedding, params["target"], 1)
-    return learned if system.drape is None else learned + drape.offsets(system.drape, window)
+    return learned if draped is None else learned + drape.offsets(system.drape, draped)
+
+
+def draped_at_rest(config: SmadConfig, system: System, window: Float[Array, "w p"]) -> Float[Array, "l c"] | None:
+    """What a state knows of the drape where the window has been the same for long; None without a drape."""
+    if system.drape is None:
+        return None
+    found = drape.at_rest(system.drape, window[:: config.deformer.pose_stride])
+    return jnp.repeat(found[None], max(config.dynamics.memory, 1), axis=0)
+
+
+def draped_after(
+    config: SmadConfig, system: System, draped: Float[Array, "l c"] | None, window: Float[Array, "w p"]
+) -> Float[Array, "l c"] | None:
+    """What a state knows of the drape a frame later, under the next window."""
+    if draped is None:
+        return None
+    found = drape.components(system.drape, window[:: config.deformer.pose_stride], draped[-1])
+    return jnp.concatenate([found[None], draped[:-1]])
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def draped_under(config: SmadConfig, system: System, features: Float[Array, "t p"]) -> Float[Array, "t c"] | None:
+    """The drape's components under every one of t poses; before the first the body is taken to have stood still."""
+    if system.drape is None:
+        return None
+
+    def at(draped, frame):
+        draped = draped_after(config, system, draped, _window(config, features, frame))
+        return draped, draped[0]
+
+    begin = draped_at_rest(config, system, _window(config, features, jnp.int32(0)))
+    return jnp.concatenate([begin[:1], jax.lax.scan(at, begin, jnp.arange(1, len(features)))[1]])
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def without_swing(
     config: SmadConfig, params: Params, system: System, poses: Pose
 ) -> tuple[Float[Array, "t n 3"], Float[Array, "t n 3"]]:
-    """The driven surface under every one of t poses, and the nodes at the equilibrium that poses alone determine, both
-    in the body frames; before the first pose the body is taken to have stood still."""
+    """The driven surface under every one of t poses, and the nodes at their equilibrium, both in the body frames;
+    before the first pose the body is taken to have stood still."""
     surface = surfaces(system, poses)
     features = pose_features(config, system, poses)
 
-    def at(frame):
-        back = jnp.maximum(frame - jnp.arange(config.deformer.pose_span), 0)
-        return settled(config, params, system, features[back])
+    def at(now):
+        frame, draped = now
+        return settled(config, params, system, _window(config, features, frame), draped)
 
-    return surface, surface + jax.lax.map(at, jnp.arange(len(surface)))
+    return surface, surface + jax.lax.map(at, (jnp.arange(len(surface)), draped_under(config, system, features)))
 
 
 def reset(config: SmadConfig, params: Params, system: System, pose: Pose) -> State:
@@ -190,8 +230,9 @@ def reset(config: SmadConfig, params: Params, system: System, pose: Pose) -> Sta
     features = _normalised(system, driving.features(pose, pose, config.dt))
     window = jnp.repeat(features[None], config.deformer.pose_span, axis=0)
     still = jnp.zeros((len(surface), max(config.deformer.velocities, 1), 3))
-    offset = settled(config, params, system, window)
-    return State(offset, still, jnp.stack([offset, offset]), jnp.stack([surface, surface]), window, pose)
+    draped = draped_at_rest(config, system, window)
+    offset = settled(config, params, system, window, jax.tree.map(lambda x: x[0], draped))
+    return State(offset, still, jnp.stack([offset, offset]), jnp.stack([surface, surface]), window, pose, draped)
 
 
 def step(config: SmadConfig, params: Params, system: System, state: State, pose: Pose) -> tuple[State, deformer.Deltas]:
@@ -207,7 +248,9 @@ def step(config: SmadConfig, params: Params, system: System, state: State, pose:
     # How the surface accelerates in the world, seen in the body frame: a second difference, which is late by a frame.
     lurch = _turned(pose, world - 2 * state.driven[0] + state.driven[1]) / config.dt**2
     sweep = _turned(pose, world - state.driven[0]) / config.dt
-    equilibrium = jnp.concatenate([settled(config, params, system, window)[None], state.equilibrium])
+    draped = draped_after(config, system, state.draped, window)
+    now = settled(config, params, system, window, jax.tree.map(lambda x: x[0], draped))
+    equilibrium = jnp.concatenate([now[None], state.equilibrium])
     swing = state.offset - equilibrium[1]
     inputs = [system.graph.positions, state.offset / scaling.offset, swing / scaling.offset]
     inputs += [sweep, lurch / scaling.drive]
@@ -234,7 +277,7 @@ def step(config: SmadConfig, params: Params, system: System, state: State, pose:
         offset, velocity = msd.euler_step(state.offset, state.velocities[:, 0], acceleration, config.dt)
     velocities = jnp.concatenate([velocity[:, None], state.velocities[:, :-1]], axis=1)
     driven_now = jnp.stack([world, state.driven[0]])
-    return State(offset, velocities, equilibrium[:2], driven_now, window, pose), deltas
+    return State(offset, velocities, equilibrium[:2], driven_now, window, pose, draped), deltas
 
 
 def positions(system: System, state: State) -> Float[Array, "n 3"]:
@@ -252,6 +295,11 @@ def rollout(
         return state, positions(system, state)
 
     return jax.lax.scan(advance, state, poses)
+
+
+def _window(config: SmadConfig, features: Float[Array, "t p"], frame: Int[Array, ""]) -> Float[Array, "w p"]:
+    """The window of pose features that ends in a frame of a take."""
+    return features[jnp.maximum(frame - jnp.arange(config.deformer.pose_span), 0)]
 
 
 def _turned(pose: Pose, vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

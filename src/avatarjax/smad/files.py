@@ -21,7 +21,7 @@ from avatarjax.smad.graph import Graph
 from avatarjax.smad.kernel import Kernel
 from avatarjax.smad.skeletal import Skin
 
-VERSION = 4
+VERSION = 5
 FILE = "avatar.safetensors"
 
 

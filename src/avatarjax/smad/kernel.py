@@ -54,9 +54,18 @@ def fit(
     kept = kept[sizes[kept] > 1e-9 * sizes.max()]
     projection = directions[:, kept] * sizes[kept] ** (-LEVELLED / 2)
     points = (x - mean) @ projection
-    some = np.sort(np.random.default_rng(seed).permutation(len(points))[:centres])
-    parts = mean, projection, points[some], np.asarray(WIDTH * 2 * points.var(axis=0).sum())
+    parts = mean, projection, points[chosen(len(points), centres, seed)], reach(points)
     return Kernel(*(jnp.asarray(part, jnp.float32) for part in parts))
+
+
+def chosen(frames: int, centres: int, seed: int) -> Int[np.ndarray, " m"]:
+    """The frames whose windows are centres: so many, or all where there are fewer."""
+    return np.sort(np.random.default_rng(seed).permutation(frames)[:centres])
+
+
+def reach(points: Float[np.ndarray, "f q"]) -> np.ndarray:
+    """The width of a kernel of such points: WIDTH times the mean squared distance of two of them."""
+    return np.asarray(WIDTH * 2 * points.var(axis=0).sum())
 
 
 def windows(

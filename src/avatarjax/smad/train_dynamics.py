@@ -21,6 +21,7 @@ from avatarjax.nets.functional import Params
 from avatarjax.smad import deformer, drape, driving, dynamics, kernel
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.deformer import Deltas
+from avatarjax.smad.drape import Drape
 from avatarjax.smad.driving import Pose
 from avatarjax.smad.dynamics import Known, Scaling, State, System
 from avatarjax.smad.graph import Graph
@@ -42,14 +43,15 @@ class Take:
 @flax.struct.dataclass
 class Recorded:
     """All frames of some takes, one after the other, as training needs them: poses (f, ...), offsets (f, n, 3) from the
-    driven surface, that surface in the world (f, n, 3), normalised pose features (f, p), and the first frame (f,) of
-    the take that a frame belongs to."""
+    driven surface, that surface in the world (f, n, 3), normalised pose features (f, p), the first frame (f,) of the
+    take that a frame belongs to, and the drape's components (f, c) where there is one, begun at rest in each take."""
 
     poses: Pose
     offsets: Float[Array, "f n 3"]
     driven: Float[Array, "f n 3"]
     features: Float[Array, "f p"]
     first: Int[Array, "f"]
+    draped: Float[Array, "f c"] | None = None
 
 
 def fit_system(config: SmadConfig, graph: Graph, skin: Skin | None, takes: Sequence[Take]) -> System:
@@ -81,19 +83,24 @@ def fit_system(config: SmadConfig, graph: Graph, skin: Skin | None, takes: Seque
         acceleration=spread(offsets, 2),
         drive=spread([part.driven for part in recorded], 2),
     )
-    system, settings = System(graph, skin, scaling), config.dynamics
-    if not (config.equilibrium and settings.components):
+    system = System(graph, skin, scaling)
+    if not (config.equilibrium and config.dynamics.components):
         return system
-    whole = record(config, system, takes)
-    fitted = drape.fit(
-        *(whole.offsets, whole.features, whole.first),
-        components=min(settings.components, len(whole.first)),
+    return system.replace(drape=fit_drape(config, record(config, system, takes)))
+
+
+def fit_drape(config: SmadConfig, recorded: Recorded) -> Drape:
+    """The drape of recorded takes, in closed form."""
+    settings = config.dynamics
+    return drape.fit(
+        *(recorded.offsets, recorded.features, recorded.first),
+        components=min(settings.components, len(recorded.first)),
         window=config.deformer.pose_window,
         stride=config.deformer.pose_stride,
+        memory=settings.memory,
         ridge=settings.ridge,
         centres=settings.centres,
     )
-    return system.replace(drape=fitted)
 
 
 def knowing(config: SmadConfig, params: Params, system: System, recorded: Recorded) -> System:
@@ -118,13 +125,15 @@ def record(config: SmadConfig, system: System, takes: Sequence[Take]) -> Recorde
     parts, start = [], 0
     for take in takes:
         surface = dynamics.surfaces(system, take.poses)
+        features = dynamics.pose_features(config, system, take.poses)
         parts.append(
             Recorded(
                 poses=take.poses,
                 offsets=take.positions - surface,
                 driven=driving.to_world(take.poses, surface),
-                features=dynamics.pose_features(config, system, take.poses),
+                features=features,
                 first=jnp.full(len(take.positions), start, jnp.int32),
+                draped=dynamics.draped_under(config, system, features),
             )
         )
         start += len(take.positions)
@@ -150,6 +159,11 @@ def window_at(config: SmadConfig, recorded: Recorded, frame: Int[Array, ""]) -> 
     return _windows(config, recorded, frame[None])[0]
 
 
+def draped_at(recorded: Recorded, frames: Int[Array, "..."]) -> Float[Array, "... c"] | None:
+    """The drape's components in some frames; None without a drape."""
+    return jax.tree.map(lambda x: x[frames], recorded.draped)
+
+
 def _back(config: SmadConfig, recorded: Recorded, frame: Int[Array, ""]) -> Int[Array, "k"]:
     """A frame and those before it that a state remembers."""
     return jnp.maximum(frame - jnp.arange(max(config.deformer.velocities, 1) + 1), recorded.first[frame])
@@ -165,11 +179,12 @@ def _settled(
     config: SmadConfig, params: Params, system: System, recorded: Recorded, frames: Int[Array, "k"]
 ) -> Float[Array, "k n 3"]:
     """The equilibrium in each frame."""
-    windows = _windows(config, recorded, frames)
-    return jax.vmap(lambda window: dynamics.settled(config, params, system, window))(windows)
+    windows, draped = _windows(config, recorded, frames), draped_at(recorded, frames)
+    return jax.vmap(lambda *now: dynamics.settled(config, params, system, *now))(windows, draped)
 
 
 def _state(config: SmadConfig, recorded: Recorded, back: Int[Array, "k"], offsets, equilibrium) -> State:
+    start = jnp.asarray(recorded.first)[back[0]]
     return State(
         offset=offsets[0],
         velocities=jnp.swapaxes((offsets[:-1] - offsets[1:]) / config.dt, 0, 1),
@@ -177,6 +192,7 @@ def _state(config: SmadConfig, recorded: Recorded, back: Int[Array, "k"], offset
         driven=jnp.asarray(recorded.driven)[back[:2]],
         window=window_at(config, recorded, back[0]),
         pose=jax.tree.map(lambda x: x[back[0]], recorded.poses),
+        draped=draped_at(recorded, jnp.maximum(back[0] - jnp.arange(max(config.dynamics.memory, 1)), start)),
     )
 
 
@@ -294,8 +310,8 @@ def train_target(config: SmadConfig, system: System, recorded: Recorded, run: Ru
     def loss(params, key, batch):
         def missed(frame):
             recorded = batch["recorded"]
-            window = window_at(config, recorded, frame)
-            return jnp.mean((dynamics.settled(config, params, system, window) - recorded.offsets[frame]) ** 2)
+            now = window_at(config, recorded, frame), draped_at(recorded, frame)
+            return jnp.mean((dynamics.settled(config, params, system, *now) - recorded.offsets[frame]) ** 2)
 
         return jnp.mean(jax.vmap(missed)(batch["frames"])) / batch["system"].scaling.offset ** 2, {}
 

@@ -152,8 +152,8 @@ def views_of(avatar: Avatar, takes: Footage, count: int) -> Views:
 
 def _at(avatar: Avatar, recorded: Recorded, frame: Int[Array, ""]) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
     """The nodes at their equilibrium in a frame, and its offset."""
-    window = train_dynamics.window_at(avatar.config, recorded, frame)
-    offset = dynamics.settled(avatar.config, avatar.params, avatar.system, window)
+    now = train_dynamics.window_at(avatar.config, recorded, frame), train_dynamics.draped_at(recorded, frame)
+    offset = dynamics.settled(avatar.config, avatar.params, avatar.system, *now)
     pose = jax.tree.map(lambda x: x[frame], recorded.poses)
     return dynamics.driven(avatar.system, pose) + offset, offset
 
