@@ -14,7 +14,7 @@ from experiments import unica_dynamics_measures as measures
 from tests.unica.conftest import TINY
 
 MODELS = ("coefficients", "unet-turned")
-STEPS = {"coefficients": 3, "vae": 2, "unet": 2}
+STEPS = {"coefficients": 3, "vae": 3, "unet": 3}
 
 
 @pytest.fixture(scope="module")

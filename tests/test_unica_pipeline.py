@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import avatarjax as aj
-from avatarjax.train import StageConfig
 from avatarjax.unica import config as configs
 from experiments import unica as experiment
 from experiments.tables import __main__ as tables
@@ -19,23 +18,16 @@ from experiments.tables.finished import Finished
 from tests.unica.conftest import TINY
 
 SCRIPT = (1,) * 10 + (2,) * 10
-FEW = StageConfig(3, 2, 1e-3)
 
 
 def tiny():
-    """Every stage, in a few steps of the smallest networks, on the dataset that other tests have as well."""
+    """Every stage of the smallest networks, on the dataset that other tests have as well."""
     return dataclasses.replace(
         TINY,
         pca_components=24,
         train_both=True,
         data=dataclasses.replace(TINY.data, cloth_steps=4, vertices="float16"),
         lpips_network="alex",
-        vae_stage=FEW,
-        unet_stage=FEW,
-        coefficients_stage=dataclasses.replace(FEW, ema=0.9, batch=8),
-        base_stage=FEW,
-        appearance_stage=FEW,
-        texels_stage=FEW,
     )
 
 

@@ -5,7 +5,7 @@ import optax
 import pytest
 
 from avatarjax.train import make_step, new_state, weights
-from avatarjax.train.state import SMALL, optimiser, packed, together, unpacked
+from avatarjax.train.state import SMALL, optimiser, packed, scheduled, together, unpacked
 
 
 def quadratic(params, key, batch):
@@ -165,6 +165,14 @@ def test_every_step_has_its_own_randomness(key):
     assert len({round(x, 4) for x in losses}) == 3
 
 
+def test_other_numbers_of_steps_are_the_same_program(key):
+    def lowered(rate, steps):
+        transform = optimiser(rate, steps)
+        return make_step(quadratic, transform).lower(fresh(key, transform), TARGET).as_text()
+
+    assert lowered(1e-3, 100) == lowered(1e-2, 5_000)
+
+
 def test_the_rate_warms_up_then_decays_to_a_tenth():
     """Under a constant gradient Adam's steps are as long as the rate."""
     transform = optimiser(0.5, 100)
@@ -177,4 +185,10 @@ def test_the_rate_warms_up_then_decays_to_a_tenth():
     assert rates[0] == pytest.approx(0.025, rel=1e-2)
     assert max(rates) == pytest.approx(0.5, rel=1e-2) and int(np.argmax(rates)) == 3
     assert rates[-1] == pytest.approx(0.05, rel=1e-2)
+    published = optax.warmup_cosine_decay_schedule(0.025, 0.5, 3, 100, 0.05)
+    moves = scheduled(0.5, 100)
+    state = moves.init(None)
+    for k in range(120):
+        step, state = moves.update(jnp.ones(()), state)
+        assert float(step) == pytest.approx(-float(published(k)), rel=1e-4)
     assert (np.diff(rates[3:]) < 1e-5).all()

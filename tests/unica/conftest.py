@@ -10,6 +10,7 @@ import pytest
 from avatarjax import posmap
 from avatarjax.nets.point_transformer import PointTransformerConfig
 from avatarjax.posmap import pca as pcs
+from avatarjax.train import StageConfig
 from avatarjax.unica import Avatar, appearance, batches, fit, texel_head, train, train_appearance
 from avatarjax.unica.appearance import AppearanceConfig, AppearanceNetwork
 from avatarjax.unica.coefficients import CoefficientConfig, CoefficientDenoiser, CoefficientDynamics
@@ -20,6 +21,8 @@ from avatarjax.unica.texel_head import TexelHead, TexelHeadConfig
 from avatarjax.unica.vae import VAE, VAEConfig
 from tests.parameters import random_params
 
+# The same steps everywhere: what one test has compiled serves others.
+FEW = StageConfig(3, 2, 1e-3)
 TINY = UnicaConfig(
     size=32,
     upscaled=64,
@@ -52,6 +55,12 @@ TINY = UnicaConfig(
         offset_bound=0.05,
     ),
     views_per_step=2,
+    vae_stage=FEW,
+    unet_stage=FEW,
+    coefficients_stage=dataclasses.replace(FEW, ema=0.9, batch=8),
+    base_stage=FEW,
+    appearance_stage=FEW,
+    texels_stage=FEW,
 )
 
 
