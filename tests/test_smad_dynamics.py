@@ -22,7 +22,7 @@ from experiments import smad_motions
 from experiments.smad_motions import Motions
 
 CI = configs.preset("ci")
-FRAMES = 60
+FRAMES = 120  # of all takes, so that what is compiled for one serves all
 
 
 def swinging(frames=120, late=0.0):
@@ -130,7 +130,7 @@ def finished(tmp_path_factory):
             performances, "perform", lambda *a: jax.tree.map(lambda x: x[: 1 if a[1] == "turn" else FRAMES], whole(*a))
         )
         patch.setattr(smad_motions, "KEPT", 200)
-        patch.setattr(smad_motions, "LONG", 120)
+        patch.setattr(smad_motions, "LONG", FRAMES)
         patch.setattr(
             experiment,
             "MOTIONS",
