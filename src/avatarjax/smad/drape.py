@@ -3,13 +3,13 @@
 Kernel ridge regression of the offsets' principal components c from windows x of poses (`kernel`) and, with a memory,
 from how the cloth lay l frames before,
 
-    c_t = sum_m w_m near_m(x_t) exp(-|c_{t-l} - p_m|^2 / reach)
+    c_t = sum_m w_m near_m(x_t) exp(-|P c_{t-l} - p_m|^2 / reach)
 
-where p_m is how it lay l frames before centre m: a dynamical system that is learned without a gradient. It answers to
-itself only every l frames, so that its errors are not carried on thirty times a second (docs/smad.md). Solved with the
-Nyström method (Williams & Seeger 2001, "Using the Nyström Method to Speed Up Kernel Machines"). It bends where linear
-regression cannot, and far from all that it was learned from it falls back on the mean drape, where linear regression
-goes on.
+where P takes the first components, and p_m are those of l frames before centre m: a dynamical system that is learned
+without a gradient. It answers to itself only every l frames, so that its errors are not carried on thirty times a
+second (docs/smad.md). Solved with the Nyström method (Williams & Seeger 2001, "Using the Nyström Method to Speed Up
+Kernel Machines"). It bends where linear regression cannot, and far from all that it was learned from it falls back on
+the mean drape, where linear regression goes on.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ from avatarjax.smad.kernel import Kernel
 
 # Of the kernel's own variance, 1: what keeps its factor real in double precision.
 _JITTER = 1e-8
+# So many components, the largest, are how it lay before: the smaller ones are less certain of themselves, and
+# under keys that are held long a memory of all of them settles further from the truth.
+REMEMBERED = 12
 # How often a drape is asked what follows itself until it is taken to be at rest.
 _RESTING = 50
 
@@ -36,13 +39,14 @@ _RESTING = 50
 @flax.struct.dataclass
 class Drape:
     """The mean offset (n, 3), components (c, n, 3) of it, and the kernel whose m values have weights (m, c); with a
-    memory also how cloth lay before each centre, past (m, c), and the width () of the kernel of that."""
+    memory also the first components of how cloth lay before each centre, past (m, r), and the width () of the kernel
+    of that."""
 
     mean: Float[Array, "n 3"]
     basis: Float[Array, "c n 3"]
     kernel: Kernel
     weights: Float[Array, "m c"]
-    past: Float[Array, "m c"] | None = None
+    past: Float[Array, "m r"] | None = None
     reach: Float[Array, ""] | None = None
 
 
@@ -71,7 +75,8 @@ def fit(
     inputs = [(kernel.windows(features, first, window, stride) - x) @ projection / np.sqrt(float(fitted.width))]
     some, past, reach = kernel.chosen(len(wanted), centres, seed), None, None
     if memory:
-        before, reach = wanted[np.maximum(np.arange(len(wanted)) - memory, first)], kernel.reach(wanted)
+        before = wanted[np.maximum(np.arange(len(wanted)) - memory, first), :REMEMBERED]
+        reach = kernel.reach(before)
         inputs, past = [*inputs, before / np.sqrt(reach)], before[some]
     points = np.concatenate(inputs, axis=1)
     middle = points[some]
@@ -93,7 +98,8 @@ def components(drape: Drape, window: Float[Array, "w p"], before: Float[Array, "
     many frames before as the drape remembers, and nothing to one without a memory."""
     near = kernel.near(drape.kernel, window)
     if drape.past is not None:
-        near = near * jnp.exp(-jnp.sum((drape.past - before[None]) ** 2, axis=1) / drape.reach)
+        apart = drape.past - before[None, : drape.past.shape[1]]
+        near = near * jnp.exp(-jnp.sum(apart**2, axis=1) / drape.reach)
     return near @ drape.weights
 
 
