@@ -51,7 +51,7 @@ def of_avatar(config: SmadConfig, params: Params, system: System) -> Method:
 
 
 def of_equilibrium(config: SmadConfig, params: Params, system: System) -> Method:
-    """What a window of poses alone says."""
+    """The equilibrium alone, without swing."""
     return lambda _, take: np.asarray(dynamics.without_swing(config, params, system, take.poses)[1])
 
 

@@ -104,6 +104,22 @@ def test_the_equilibrium_departs_from_the_drape(system, takes):
     assert train_dynamics.fit_system(without, system.graph, None, takes).drape is None
 
 
+def test_rollouts_and_recordings_remember_the_same_drape(system, takes):
+    """Also shortly after the start, before which the cloth hung at rest."""
+    params = dynamics.init(CONFIG, system, jax.random.key(0))
+    recorded = train_dynamics.record(CONFIG, system, takes[:2])
+    poses = takes[1].poses
+    state = dynamics.reset(CONFIG, params, system, jax.tree.map(lambda x: x[0], poses))
+    advance = jax.jit(dynamics.step, static_argnums=0)
+    for frame in range(1, 11):
+        state, _ = advance(CONFIG, params, system, state, jax.tree.map(lambda x, k=frame: x[k], poses))
+        if frame in (3, 10):
+            begun = train_dynamics.calm_at(CONFIG, params, system, recorded, jnp.asarray(70 + frame))
+            assert state.draped.shape == (CONFIG.dynamics.memory, CONFIG.dynamics.components)
+            np.testing.assert_allclose(state.draped, begun.draped, atol=1e-5)
+            np.testing.assert_allclose(state.equilibrium, begun.equilibrium, atol=1e-5)
+
+
 def test_what_is_unlike_all_that_was_learned_from_has_the_usual_equilibrium(bare, takes):
     recorded = train_dynamics.record(CONFIG, bare, takes)
     params = dynamics.init(CONFIG, bare, jax.random.key(0))

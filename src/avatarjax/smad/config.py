@@ -147,8 +147,8 @@ class SmadConfig:
 
     motion: "springs" is Eq. 4, the Euler step of a mass-spring-damper whose acceleration the network adds to; "deltas"
     is B.2, where the network says directly how far a node is from its equilibrium, and refines its velocity.
-    equilibrium: ours, offsets that a window of poses alone determines; without it all motion is the system's, as in the
-    paper.
+    equilibrium: ours, offsets that a window of poses (and the drape's memory) determines; without it all motion is the
+    system's, as in the paper.
     """
 
     film: FilmConfig = FilmConfig()
