@@ -97,7 +97,7 @@ def components(drape: Drape, window: Float[Array, "w p"], before: Float[Array, "
     """How cloth lies under one window of poses, newest first, as components of the drape; `before` is how it lay as
     many frames before as the drape remembers, and nothing to one without a memory."""
     near = kernel.near(drape.kernel, window)
-    if drape.past is not None:
+    if drape.past is not None and drape.reach is not None:
         apart = drape.past - before[None, : drape.past.shape[1]]
         near = near * jnp.exp(-jnp.sum(apart**2, axis=1) / drape.reach)
     return near @ drape.weights

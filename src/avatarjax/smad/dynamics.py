@@ -185,11 +185,9 @@ def draped_at_rest(config: SmadConfig, system: System, window: Float[Array, "w p
 
 
 def draped_after(
-    config: SmadConfig, system: System, draped: Float[Array, "l c"] | None, window: Float[Array, "w p"]
-) -> Float[Array, "l c"] | None:
+    config: SmadConfig, system: System, draped: Float[Array, "l c"], window: Float[Array, "w p"]
+) -> Float[Array, "l c"]:
     """What a state knows of the drape a frame later, under the next window."""
-    if draped is None:
-        return None
     found = drape.components(system.drape, window[:: config.deformer.pose_stride], draped[-1])
     return jnp.concatenate([found[None], draped[:-1]])
 
@@ -197,14 +195,14 @@ def draped_after(
 @functools.partial(jax.jit, static_argnames="config")
 def draped_under(config: SmadConfig, system: System, features: Float[Array, "t p"]) -> Float[Array, "t c"] | None:
     """The drape's components under every one of t poses; before the first the body is taken to have stood still."""
-    if system.drape is None:
+    begin = draped_at_rest(config, system, _window(config, features, jnp.int32(0)))
+    if begin is None:
         return None
 
     def at(draped, frame):
         draped = draped_after(config, system, draped, _window(config, features, frame))
         return draped, draped[0]
 
-    begin = draped_at_rest(config, system, _window(config, features, jnp.int32(0)))
     return jnp.concatenate([begin[:1], jax.lax.scan(at, begin, jnp.arange(1, len(features)))[1]])
 
 
@@ -248,7 +246,7 @@ def step(config: SmadConfig, params: Params, system: System, state: State, pose:
     # How the surface accelerates in the world, seen in the body frame: a second difference, which is late by a frame.
     lurch = _turned(pose, world - 2 * state.driven[0] + state.driven[1]) / config.dt**2
     sweep = _turned(pose, world - state.driven[0]) / config.dt
-    draped = draped_after(config, system, state.draped, window)
+    draped = None if state.draped is None else draped_after(config, system, state.draped, window)
     now = settled(config, params, system, window, jax.tree.map(lambda x: x[0], draped))
     equilibrium = jnp.concatenate([now[None], state.equilibrium])
     swing = state.offset - equilibrium[1]
