@@ -110,16 +110,23 @@ def test_with_a_memory_what_comes_late_is_followed_from_rest():
     assert errors[LAG] < 0.3 * errors[0]
 
 
-def test_a_memory_counts_as_a_window_does(takes):
-    """Under the same window the nearer the past is to a centre's, the more that centre counts; far from all of them
-    cloth lies as in the mean."""
-    found = fit(takes, centres=50, memory=LAG)
-    window, past = jnp.zeros((WINDOW, 2)), found.past[3]
-    near = kernel.near(found.kernel, window)
-    apart = np.sum((np.asarray(found.past) - np.asarray(past)) ** 2, axis=1)
-    expected = (np.asarray(near) * np.exp(-apart / float(found.reach))) @ np.asarray(found.weights)
-    np.testing.assert_allclose(drape.components(found, window, past), expected, atol=1e-5)
-    np.testing.assert_allclose(drape.components(found, window, past + 50.0), 0.0, atol=1e-7)
+def test_with_every_window_a_centre_a_memory_is_a_kernel_of_both(takes):
+    """And far from every past what is left is a share of what windows say."""
+    offsets, features, first = (np.asarray(x, np.float64) for x in takes)
+    count, first = len(features), first.astype(int)
+    found = fit(takes, ridge=0.2, centres=count, memory=LAG)
+    poses = jnp.asarray(windows(features, first), jnp.float32)
+    flat = (offsets - offsets.mean(0)).reshape(count, -1)
+    wanted = flat @ np.asarray(found.basis, np.float64).reshape(3, -1).T
+    before = wanted[np.maximum(np.arange(count) - LAG, first)]
+    apart = np.sum((before[:, None] - before[None]) ** 2, axis=2)
+    alone = np.asarray(jax.vmap(lambda window: kernel.near(found.kernel, window))(poses), np.float64)
+    both = alone * (drape.ANYHOW + (1 - drape.ANYHOW) * np.exp(-apart / (kernel.WIDTH * 2 * before.var(0).sum())))
+    expected = both @ np.linalg.solve(both + 0.2 * np.eye(count), wanted)
+    here = [drape.components(found, poses[k], jnp.asarray(before[k], jnp.float32)) for k in (0, 40, 300)]
+    np.testing.assert_allclose(here, expected[[0, 40, 300]], atol=2e-4)
+    lost = drape.components(found, poses[40], jnp.full(3, 50.0))
+    np.testing.assert_allclose(lost, drape.ANYHOW * alone[40] @ np.asarray(found.weights), atol=1e-4)
 
 
 def test_at_rest_it_stays(takes):

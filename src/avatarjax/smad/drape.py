@@ -3,9 +3,9 @@
 Kernel ridge regression of the offsets' principal components c from windows x of poses (`kernel`) and, with a memory,
 from how the cloth lay l frames before,
 
-    c_t = sum_m w_m near_m(x_t) exp(-|P c_{t-l} - p_m|^2 / reach)
+    c_t = sum_m w_m near_m(x_t) (a + (1 - a) exp(-|c_{t-l} - p_m|^2 / reach))
 
-where P takes the first components, and p_m are those of l frames before centre m: a dynamical system that is learned
+where p_m is how it lay l frames before centre m: a dynamical system that is learned
 without a gradient. It answers to itself only every l frames, so that its errors are not carried on thirty times a
 second (docs/smad.md). Solved with the Nyström method (Williams & Seeger 2001, "Using the Nyström Method to Speed Up
 Kernel Machines"). It bends where linear regression cannot, and far from all that it was learned from it falls back on
@@ -28,9 +28,8 @@ from avatarjax.smad.kernel import Kernel
 
 # Of the kernel's own variance, 1: what keeps its factor real in double precision.
 _JITTER = 1e-8
-# So many components, the largest, are how it lay before: the smaller ones are less certain of themselves, and
-# under keys that are held long a memory of all of them settles further from the truth.
-REMEMBERED = 12
+# The share of a centre that counts whatever was before: what is left of it where the past is unlike any.
+ANYHOW = 0.3
 # How often a drape is asked what follows itself until it is taken to be at rest.
 _RESTING = 50
 
@@ -39,14 +38,13 @@ _RESTING = 50
 @flax.struct.dataclass
 class Drape:
     """The mean offset (n, 3), components (c, n, 3) of it, and the kernel whose m values have weights (m, c); with a
-    memory also the first components of how cloth lay before each centre, past (m, r), and the width () of the kernel
-    of that."""
+    memory also how cloth lay before each centre, past (m, c), and the width () of the kernel of that."""
 
     mean: Float[Array, "n 3"]
     basis: Float[Array, "c n 3"]
     kernel: Kernel
     weights: Float[Array, "m c"]
-    past: Float[Array, "m r"] | None = None
+    past: Float[Array, "m c"] | None = None
     reach: Float[Array, ""] | None = None
 
 
@@ -72,25 +70,30 @@ def fit(
     mean, basis, wanted = linear.principal(offsets, components)
     fitted = kernel.fit(features, first, window=window, stride=stride, centres=centres, seed=seed)
     x, projection = (np.asarray(each, np.float64) for each in (fitted.mean, fitted.projection))
-    inputs = [(kernel.windows(features, first, window, stride) - x) @ projection / np.sqrt(float(fitted.width))]
-    some, past, reach = kernel.chosen(len(wanted), centres, seed), None, None
+    points = [(kernel.windows(features, first, window, stride) - x) @ projection]
+    widths, past, reach = [float(fitted.width)], None, None
+    some = kernel.chosen(len(wanted), centres, seed)
     if memory:
-        before = wanted[np.maximum(np.arange(len(wanted)) - memory, first), :REMEMBERED]
-        reach = kernel.reach(before)
-        inputs, past = [*inputs, before / np.sqrt(reach)], before[some]
-    points = np.concatenate(inputs, axis=1)
-    middle = points[some]
+        before = wanted[np.maximum(np.arange(len(wanted)) - memory, first)]
+        past, reach = before[some], kernel.reach(before)
+        points, widths = [*points, before], [*widths, float(reach)]
+    middle = [part[some] for part in points]
 
     def near(a, b):
-        apart = np.sum(a**2, axis=1)[:, None] + np.sum(b**2, axis=1) - 2 * a @ b.T
-        return np.exp(-np.maximum(apart, 0))
+        found = [_gaussian(*each) for each in zip(a, b, widths, strict=True)]
+        return found[0] * (ANYHOW + (1 - ANYHOW) * found[1]) if memory else found[0]
 
-    factor = np.linalg.cholesky(near(middle, middle) + _JITTER * np.eye(len(middle)))
+    factor = np.linalg.cholesky(near(middle, middle) + _JITTER * np.eye(len(some)))
     design = scipy.linalg.solve_triangular(factor, near(middle, points), lower=True).T
-    found = np.linalg.solve(design.T @ design + ridge * np.eye(len(middle)), design.T @ wanted)
+    found = np.linalg.solve(design.T @ design + ridge * np.eye(len(some)), design.T @ wanted)
     weights = scipy.linalg.solve_triangular(factor.T, found)
     arrays = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), (mean, basis, weights, past, reach))
     return Drape(*arrays[:2], fitted, *arrays[2:])
+
+
+def _gaussian(a: Float[np.ndarray, "f q"], b: Float[np.ndarray, "g q"], width: float) -> Float[np.ndarray, "f g"]:
+    apart = np.sum(a**2, axis=1)[:, None] + np.sum(b**2, axis=1) - 2 * a @ b.T
+    return np.exp(-np.maximum(apart, 0) / width)
 
 
 def components(drape: Drape, window: Float[Array, "w p"], before: Float[Array, "c"]) -> Float[Array, "c"]:
@@ -98,8 +101,8 @@ def components(drape: Drape, window: Float[Array, "w p"], before: Float[Array, "
     many frames before as the drape remembers, and nothing to one without a memory."""
     near = kernel.near(drape.kernel, window)
     if drape.past is not None and drape.reach is not None:
-        apart = drape.past - before[None, : drape.past.shape[1]]
-        near = near * jnp.exp(-jnp.sum(apart**2, axis=1) / drape.reach)
+        like = jnp.exp(-jnp.sum((drape.past - before[None]) ** 2, axis=1) / drape.reach)
+        near = near * (ANYHOW + (1 - ANYHOW) * like)
     return near @ drape.weights
 
 
