@@ -5,11 +5,11 @@ from how the cloth lay l frames before,
 
     c_t = sum_m w_m near_m(x_t) (a + (1 - a) exp(-|c_{t-l} - p_m|^2 / reach))
 
-where p_m is how it lay l frames before centre m: a dynamical system that is learned
-without a gradient. It answers to itself only every l frames, so that its errors are not carried on thirty times a
-second (docs/smad.md). Solved with the Nyström method (Williams & Seeger 2001, "Using the Nyström Method to Speed Up
-Kernel Machines"). It bends where linear regression cannot, and far from all that it was learned from it falls back on
-the mean drape, where linear regression goes on.
+where p_m is how it lay l frames before centre m: a dynamical system that is learned without a gradient. It answers to
+itself only every l frames, so that its errors are not carried on thirty times a second (docs/smad.md). Solved with the
+Nyström method (Williams & Seeger 2001, "Using the Nyström Method to Speed Up Kernel Machines"). It bends where linear
+regression cannot, and far from all that it was learned from it falls back on the mean drape, where linear regression
+goes on.
 """
 
 from __future__ import annotations
