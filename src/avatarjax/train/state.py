@@ -52,6 +52,9 @@ def scheduled(learning_rate: float, steps: int) -> optax.GradientTransformation:
     warmup = max(1, min(200, steps * 3 // 100))
     last = max(steps, warmup + 1)
 
+    def init(params):
+        return Schedule(jnp.int32(0), jnp.float32(learning_rate), jnp.int32(warmup), jnp.int32(last))
+
     def update(gradient, state, params=None):
         done = jnp.clip((state.count - state.warmup) / (state.steps - state.warmup), 0, 1)
         rising = 0.05 + 0.95 * state.count / state.warmup
@@ -59,8 +62,7 @@ def scheduled(learning_rate: float, steps: int) -> optax.GradientTransformation:
         moves = jax.tree.map(lambda g: -share * state.peak * g, gradient)
         return moves, state._replace(count=optax.safe_increment(state.count))
 
-    numbers = jnp.int32(0), jnp.float32(learning_rate), jnp.int32(warmup), jnp.int32(last)
-    return optax.GradientTransformation(lambda params: Schedule(*map(jnp.copy, numbers)), update)
+    return optax.GradientTransformation(init, update)
 
 
 def together(transform: optax.GradientTransformation) -> optax.GradientTransformation:
