@@ -25,7 +25,7 @@ from avatarjax.cameras import Camera
 from avatarjax.data import avatars, building, capture, cloth_quality, dataset, sequences, skinning
 from avatarjax.data.mesh_renderer import MeshRenderer
 from avatarjax.data.motion import performances
-from avatarjax.data.motion.locomotion import LocomotionConfig
+from avatarjax.data.motion.locomotion import LocomotionConfig, Motion
 from avatarjax.data.wardrobe.assembly import AvatarMesh
 from avatarjax.io import atomic, exr, video, weights
 from avatarjax.metrics import foot_slide, published, responsiveness
@@ -106,8 +106,7 @@ def make(args: Args, name: str) -> dict[str, float]:
     clock.run("pictures", lambda: show(avatar, clips, folder))
     films = {}
     if args.performances:
-        for motion in performances.NAMES:
-            films[motion] = clock.run(motion, lambda m=motion: film(avatar, m, args, wanted, folder / "monocular" / m))
+        films = clock.run("performances", lambda: film(avatar, args, wanted, folder / "monocular"))
     found = numbers | {"means": {what: mean._asdict() for what, mean in means.items()}, "performances": films}
     atomic.write_text(folder / "quality.json", json.dumps(found, indent=1))
     write_report(folder, name, args, numbers, means, films, clock.seconds)
@@ -241,18 +240,23 @@ def show(avatar: AvatarMesh, clips: _Clips, folder: Path) -> None:
 
 
 def film(
-    avatar: AvatarMesh, name: str, args: Args, wanted: dataset.DatasetSpec, folder: Path
-) -> dict[str, float | None]:
-    """Film one performance, unless that was done before, and measure it."""
-    motion = jax.device_get(performances.perform(avatar.rig, name, args.seed))
-    config = XPBDConfig(substeps=wanted.cloth_steps)
-    if (folder / capture.MESHES).is_file():
-        found = weights.load_arrays(folder / capture.MESHES)[0]["vertices"].astype(np.float32)
-        vertices = found + np.asarray(motion.hips)[:, None]
-    else:
-        with tqdm(total=2 * len(motion.headings), desc=name, unit="frame") as bar:
-            size = max(128, wanted.image_size)
-            vertices = capture.film(folder, avatar, motion, size=size, config=config, progress=bar.update)
+    avatar: AvatarMesh, args: Args, wanted: dataset.DatasetSpec, folder: Path
+) -> dict[str, dict[str, float | None]]:
+    """Film every performance that was not filmed before, and measure all."""
+    motions = {name: jax.device_get(performances.perform(avatar.rig, name, args.seed)) for name in performances.NAMES}
+    missing = [name for name in motions if not (folder / name / capture.MESHES).is_file()]
+    frames = 2 * sum(len(motions[name].headings) for name in missing)
+    with tqdm(total=frames, desc="filming", unit="frame", disable=not missing) as bar:
+        takes = [capture.Take(folder / name, lambda name=name: motions[name]) for name in missing]
+        config, size = XPBDConfig(substeps=wanted.cloth_steps), max(128, wanted.image_size)
+        capture.film(takes, avatar, size=size, config=config, progress=bar.update)
+    return {name: measured(avatar, name, motion, folder / name) for name, motion in motions.items()}
+
+
+def measured(avatar: AvatarMesh, name: str, motion: Motion, folder: Path) -> dict[str, float | None]:
+    """What there is to measure of a performance that was filmed."""
+    relative = weights.load_arrays(folder / capture.MESHES)[0]["vertices"].astype(np.float32)
+    vertices = relative + np.asarray(motion.hips)[:, None]
     depth = cloth_quality.penetration(avatar, vertices[::8])
     feet = skinning.feet(avatar.rig, motion.transforms)
     slides = foot_slide.foot_slides(feet.toes, feet.balls)

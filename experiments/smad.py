@@ -28,9 +28,6 @@ from tqdm import tqdm
 
 from avatarjax import smad
 from avatarjax.data import MonocularVideo, avatars, capture, load_monocular
-from avatarjax.data.motion import performances
-from avatarjax.data.motion.locomotion import Motion
-from avatarjax.data.wardrobe.assembly import AvatarMesh
 from avatarjax.gaussians import Gaussians
 from avatarjax.io import atomic
 from avatarjax.physics.xpbd import XPBDConfig
@@ -50,8 +47,9 @@ from avatarjax.smad.config import FilmConfig, SmadConfig
 from avatarjax.smad.refine import Refined
 from avatarjax.smad.train_dynamics import Take
 from avatarjax.train import Run
-from experiments import command_line, smad_report
+from experiments import command_line, smad_motions, smad_report
 from experiments.clock import Clock
+from experiments.smad_motions import Name
 
 STAGES = ("film", "hull", "refine", "dynamics", "report")
 TRAINED = {"refine": ("refine",), "dynamics": ("dynamics_target", "drape", "swing")}
@@ -159,25 +157,24 @@ def film(experiment: Experiment) -> dict[str, list[MonocularVideo]]:
             "test": [load_monocular(path).held() for path in args.test],
         }
     keep_films(experiment.folder / "film", wanted)
-    avatar = functools.cache(lambda: avatars.build(args.avatar))
-
-    def one(name: str, seed: int) -> MonocularVideo:
-        folder = experiment.folder / "film" / f"{name}-{seed}"
-        return take(folder, avatar, lambda: jax.device_get(performances.perform(avatar().rig, name, seed)), wanted)
-
-    return {part: [one(*each) for each in getattr(wanted, part)] for part in ("train", "test", "unseen")}
+    named = {part: getattr(wanted, part) for part in ("train", "test", "unseen")}
+    found = filmed(experiment.folder / "film", args.avatar, [name for each in named.values() for name in each], wanted)
+    return {part: [found[name] for name in names] for part, names in named.items()}
 
 
-def take(
-    folder: Path, avatar: Callable[[], AvatarMesh], motion: Callable[[], Motion], wanted: FilmConfig
-) -> MonocularVideo:
-    """A take in its folder: filmed, if it is not there yet, of an avatar in a motion, which are then asked for."""
-    if not (folder / capture.MESHES).is_file():
-        performed = motion()
-        with tqdm(total=2 * len(performed.headings), desc=folder.name, unit="frame") as bar:
-            config = XPBDConfig(substeps=wanted.substeps)
-            capture.film(folder, avatar(), performed, size=wanted.size, config=config, progress=bar.update)
-    return load_monocular(folder).held()
+def filmed(folder: Path, avatar: str, names: Sequence[Name], wanted: FilmConfig) -> dict[Name, MonocularVideo]:
+    """Takes of an avatar of ours in these motions, each in a folder of its own below one, filmed where it is not there
+    yet."""
+    folders = {name: folder / f"{name[0]}-{name[1]}" for name in names}
+    missing = {name: place for name, place in folders.items() if not (place / capture.MESHES).is_file()}
+    if missing:
+        mesh, config = avatars.build(avatar), XPBDConfig(substeps=wanted.substeps)
+        takes = [capture.Take(p, functools.partial(smad_motions.perform, mesh.rig, n)) for n, p in missing.items()]
+        # Each frame is simulated, then drawn.
+        frames = 2 * sum(smad_motions.length(name) for name in missing)
+        with tqdm(total=frames, desc="filming", unit="frame") as bar:
+            capture.film(takes, mesh, size=wanted.size, config=config, progress=bar.update)
+    return {name: load_monocular(place).held() for name, place in folders.items()}
 
 
 def keep_films(folder: Path, wanted: FilmConfig) -> None:

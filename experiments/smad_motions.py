@@ -31,6 +31,7 @@ from avatarjax.smad.train_dynamics import Take
 
 KEPT = 2_000  # points of the mesh that are kept of every frame
 LONG = 960  # frames of a long sequence, over 30 seconds (SMAD Table 5)
+KEYBOARD = ("keys", "run")  # long sequences; all other motions are performances
 JITTER = 5e-4  # metres by which the body of a twin trembles
 TWIN = "twin"
 
@@ -106,10 +107,15 @@ class Stage:
         return found, skeletal.bind(self.rig, pose, found.positions), chosen
 
 
+def length(name: Name) -> int:
+    """Frames of a motion."""
+    return LONG if name[0] in KEYBOARD else performances.frame_count(name[0])
+
+
 def perform(rig: Rig, name: Name) -> Motion:
     """A performance, or a long sequence under the keyboard."""
     kind, seed = name
-    if kind not in ("keys", "run"):
+    if kind not in KEYBOARD:
         return jax.device_get(performances.perform(rig, kind, seed))
     actions = np.full(LONG, sequences.ACTIONS.index("forward"), np.int32)
     if kind == "keys":

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from avatarjax import smad
-from avatarjax.data import MonocularVideo, avatars
+from avatarjax.data import MonocularVideo
 from avatarjax.gaussians import Gaussians
 from avatarjax.metrics import drift, lpips, pretrained
 from avatarjax.metrics.published import SMAD, SMAD_2, SMAD_4, SMAD_5
@@ -92,9 +92,8 @@ class Workshop:
 
     def long(self, name: smad_motions.Name) -> MonocularVideo:
         """A long take, filmed as the others were."""
-        made = self.place / "film" / f"{name[0]}-{name[1]}"
-        avatar = functools.cache(lambda: avatars.build(self.folder.parent.name))
-        return experiment.take(made, avatar, lambda: smad_motions.perform(avatar().rig, name), self.config.film)
+        film = experiment.filmed(self.place / "film", self.folder.parent.name, [name], self.config.film)
+        return film[name]
 
     def settled(self, graph: GraphConfig) -> tuple[smad.Avatar, list[Take], Footage]:
         """What all methods on so many nodes depart from: the avatar of the run before it has learned to swing, the

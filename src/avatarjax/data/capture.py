@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+import typing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -28,6 +30,13 @@ MESHES = "meshes.safetensors"
 # Frames over which the operator smooths the path that the camera follows.
 _STEADINESS = 10.0
 _BACKGROUND = 0.93
+
+
+class Take(typing.NamedTuple):
+    """A take to film: the folder it goes to, and what makes the motion, called when its turn comes."""
+
+    folder: str | os.PathLike
+    motion: Callable[[], Motion]
 
 
 def following_camera(roots: Float[np.ndarray, "f 3"], size: int, azimuth: float = 0.0) -> Camera:
@@ -62,22 +71,50 @@ def poses_of(rig: Rig, motion: Motion) -> Poses:
 
 
 def film(
-    folder: str | os.PathLike,
+    takes: Sequence[Take],
     avatar: AvatarMesh,
-    motion: Motion,
     *,
     size: int = 512,
     config: XPBDConfig = XPBDConfig(),
     progress: Callable[[int], object] | None = None,
-) -> Float[np.ndarray, "f v 3"]:
-    """Simulate a motion, film it and write a monocular folder; returns the world vertices (f, v, 3), metres.
+) -> None:
+    """Simulate motions, film them and write a monocular folder of each.
 
     Beside what `load_monocular` reads, `meshes.safetensors` holds the true vertices relative to the root translation
-    as float16, faces and uvs. An older folder is replaced when all is done.
-    `progress` is called with numbers of frames that were simulated or drawn.
+    as float16, faces and uvs. An older folder is replaced when its take is done. While one take is drawn the next is
+    simulated, as neither keeps two cores busy. `progress` is called with numbers of frames that were simulated or
+    drawn.
     """
-    folder = Path(folder)
-    vertices = dressing.simulate(avatar, motion.transforms, config, progress=progress)
+
+    def simulated(take: Take) -> tuple[Motion, Float[np.ndarray, "f v 3"]]:
+        motion = take.motion()
+        return motion, dressing.simulate(avatar, motion.transforms, config, progress=progress)
+
+    for take, (motion, vertices) in zip(takes, _ahead(simulated, takes), strict=True):
+        _shoot(Path(take.folder), avatar, motion, vertices, size, progress)
+
+
+def _ahead(work: Callable[[Take], typing.Any], takes: Sequence[Take]) -> Iterator[typing.Any]:
+    """What `work` makes of each take; that of the next is made in a thread while one is used."""
+    with ThreadPoolExecutor(1) as thread:
+        coming = None
+        for take in takes:
+            ready, coming = coming, thread.submit(work, take)
+            if ready is not None:
+                yield ready.result()
+        if coming is not None:
+            yield coming.result()
+
+
+def _shoot(
+    folder: Path,
+    avatar: AvatarMesh,
+    motion: Motion,
+    vertices: Float[np.ndarray, "f v 3"],
+    size: int,
+    progress: Callable[[int], object] | None,
+) -> None:
+    """Draw and write a take that has been simulated."""
     camera = following_camera(np.asarray(motion.roots), size)
     renderer = MeshRenderer(avatar.faces, avatar.uvs, avatar.texture)
     shots = []
@@ -85,16 +122,14 @@ def film(
         shots.append(photograph(renderer, posed, jax.tree.map(lambda x, k=k: x[k], camera)))
         if progress:
             progress(1)
-    poses = poses_of(avatar.rig, motion)
     new = folder.with_name(f".{folder.name}.new")
     shutil.rmtree(new, ignore_errors=True)
     images, masks = zip(*shots, strict=True)
-    write_monocular(new, list(images), list(masks), camera, poses)
+    write_monocular(new, list(images), list(masks), camera, poses_of(avatar.rig, motion))
     relative = (vertices - np.asarray(motion.hips)[:, None]).astype(np.float16)
     weights.save_tree(new / MESHES, {"vertices": relative, "faces": avatar.faces, "uvs": avatar.uvs})
     shutil.rmtree(folder, ignore_errors=True)
     new.rename(folder)
-    return vertices
 
 
 def photograph(

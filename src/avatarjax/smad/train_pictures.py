@@ -22,6 +22,7 @@ from avatarjax.nets.functional import Params
 from avatarjax.smad import avatar as smad
 from avatarjax.smad import dynamics, embedded, footage, fusion, refine, train_dynamics
 from avatarjax.smad.avatar import Avatar
+from avatarjax.smad.driving import Pose
 from avatarjax.smad.footage import Footage
 from avatarjax.smad.fusion import FusionConfig, Views
 from avatarjax.smad.train_dynamics import Recorded, Take
@@ -231,10 +232,11 @@ def _with_look(gaussians: Gaussians, look: Params) -> Gaussians:
 
 def _room(avatar: Avatar, takes: Footage) -> SplatConfig:
     """Room for what skinning needs, and more."""
+    return footage.room(takes, lambda frame: _skinned(avatar, takes.poses, jnp.asarray(frame)))
 
-    def cloud_at(frame):
-        pose = jax.tree.map(lambda x: jnp.asarray(x[frame]), takes.poses)
-        nodes = dynamics.driven(avatar.system, pose)
-        return embedded.carry(avatar.binding, avatar.gaussians, avatar.system.graph, nodes)
 
-    return footage.room(takes, cloud_at)
+@jax.jit
+def _skinned(avatar: Avatar, poses: Pose, frame: Int[Array, ""]) -> Gaussians:
+    """The Gaussians where skinning alone has them, in the body frame of a frame."""
+    nodes = dynamics.driven(avatar.system, jax.tree.map(lambda x: x[frame], poses))
+    return embedded.carry(avatar.binding, avatar.gaussians, avatar.system.graph, nodes)
