@@ -45,8 +45,7 @@ class Moved(typing.NamedTuple):
 def move(avatar: smad.Avatar, poses: Pose) -> dict[str, Moved]:
     """All methods on the poses of a take."""
     after = jax.tree.map(lambda x: x[1:], poses)
-    state = smad.reset(avatar, jax.tree.map(lambda x: x[0], poses))
-    _, frames = _rollout(avatar, state, after)
+    _, frames = _rollout(avatar, _reset(avatar, poses), after)
     driven, settled = dynamics.without_swing(avatar.config, avatar.params, avatar.system, poses)
     found = {"ours": Moved(lambda k: jax.tree.map(lambda x: x[k - 1], frames.gaussians), np.asarray(frames.nodes))}
     for name, nodes in (("equilibrium alone", settled[1:]), ("skinning", driven[1:])):
@@ -56,13 +55,14 @@ def move(avatar: smad.Avatar, poses: Pose) -> dict[str, Moved]:
 
 
 def frames_a_second(avatar: smad.Avatar, poses: Pose) -> float:
-    """Of a rollout with all Gaussians, not drawn: the median of three, after one that compiles."""
-    times = []
+    """Of a rollout with all Gaussians, not drawn, under all poses but the first: the median of three, after one that
+    compiles where `move` has not."""
+    after, times = jax.tree.map(lambda x: x[1:], poses), []
     for _ in range(4):
         began = time.perf_counter()
-        jax.block_until_ready(_rollout(avatar, smad.reset(avatar, jax.tree.map(lambda x: x[0], poses)), poses))
+        jax.block_until_ready(_rollout(avatar, _reset(avatar, poses), after))
         times.append(time.perf_counter() - began)
-    return len(poses.root_translation) / float(np.median(times[1:]))
+    return len(after.root_translation) / float(np.median(times[1:]))
 
 
 def follow(avatar: smad.Avatar, take: Take) -> Moved:
@@ -99,13 +99,16 @@ def novel_views(take: MonocularVideo, texture: UInt8[np.ndarray, "h w 3"]) -> li
     roots = np.asarray(take.poses.root_translation)
     renderer = MeshRenderer(tree["faces"], tree["uvs"], texture)
 
+    @functools.lru_cache(1)
+    def mesh(frame):
+        return renderer.pose(tree["vertices"][frame].astype(np.float32) + roots[frame])
+
     def seen(azimuth):
         cameras = capture.following_camera(roots, take.masks.shape[1], azimuth)
 
         def at(frame):
             camera = jax.tree.map(lambda x: x[frame], cameras)
-            vertices = tree["vertices"][frame].astype(np.float32) + roots[frame]
-            picture, inside = capture.photograph(renderer, vertices, camera)
+            picture, inside = capture.photograph(mesh(frame), camera)
             return camera, over_black(picture, inside), inside
 
         return View(len(take), at)
@@ -118,7 +121,7 @@ def picture_errors(
 ) -> dict[str, dict[str, Estimate]]:
     """What `picture_values` are on average; those of one frame count together."""
     values = picture_values(views, moved, perceptual)
-    groups = np.tile(np.asarray(measured_frames(views[0].frames)), len(views))
+    groups = np.repeat(measured_frames(views[0].frames), len(views))
     return {name: {what: bootstrap(found, groups) for what, found in kinds.items()} for name, kinds in values.items()}
 
 
@@ -130,10 +133,10 @@ def measured_frames(count: int) -> range:
 def picture_values(
     views: Sequence[View], moved: dict[str, Moved], perceptual: lpips.Network | None
 ) -> dict[str, dict[str, list[float]]]:
-    """PSNR of the whole picture over black and inside the mask, SSIM and LPIPS of each method, for every measured frame
-    of one view after the other."""
+    """PSNR of the whole picture over black and inside the mask, SSIM and LPIPS of each method, for every view of one
+    measured frame after the other."""
     values: dict[str, dict[str, list[float]]] = {name: {} for name in moved}
-    for view, frame in itertools.product(views, measured_frames(views[0].frames)):
+    for frame, view in itertools.product(measured_frames(views[0].frames), views):
         camera, truth, inside = view.at(frame)
         mask = jnp.asarray(inside[..., None], jnp.float32)
         for name, method in moved.items():
@@ -202,6 +205,11 @@ def _vertices(video: MonocularVideo) -> np.ndarray | None:
     # Relative to the root already: only the heading is left to take away.
     pose = pose.replace(root_translation=jnp.zeros_like(pose.root_translation))
     return np.asarray(driving.to_body(pose, jnp.asarray(vertices)))
+
+
+@jax.jit
+def _reset(avatar, poses):
+    return smad.reset(avatar, jax.tree.map(lambda x: x[0], poses))
 
 
 @jax.jit

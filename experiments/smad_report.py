@@ -68,7 +68,7 @@ def write(
             results[name]["nodes"] = {r: measures.node_errors(truth, moved, c) for r, c in regions.items()}
         if take is shown[part][0] and part != "train":
             film(folder, part, recorded, moved)
-    speed = measures.frames_a_second(avatar, driving.recorded(canonical.poses))
+    speed = measures.frames_a_second(avatar, driving.recorded(measured[-1][1].poses))
     known = plain(results) | {"seconds": experiment.clock.seconds, "frames a second": speed}
     atomic.write_text(folder / "metrics.json", json.dumps(known, indent=1))
     page(experiment, avatar, results, shown, len(tracks))

@@ -135,3 +135,30 @@ def test_the_nearest_rotation_is_that_of_the_polar_decomposition():
     nearest = jax.jit(lambda m: rotations.to_matrix(rotations.nearest(m)))
     np.testing.assert_allclose(nearest(jnp.asarray(matrices, jnp.float32)), u @ vt, atol=2e-3)
     np.testing.assert_allclose(nearest(jnp.asarray(turns, jnp.float32)), turns, atol=2e-6)
+
+
+def test_gradients_of_the_nearest_rotation_are_those_of_the_polar_decomposition():
+    rng = np.random.default_rng(1)
+    turns = np.asarray(rotations.to_matrix(quaternions((50,))), np.float64)
+    # Near to turns the power iteration is exact, and so comparable with finite differences of the decomposition.
+    matrices = turns @ (np.eye(3) + 0.02 * rng.normal(size=(50, 3, 3)))
+    weights = rng.normal(size=(50, 3, 3))
+
+    def value(matrices):
+        u, _, vt = np.linalg.svd(matrices)
+        return np.sum(weights * (u @ vt), axis=(1, 2))
+
+    expected = np.zeros_like(matrices)
+    for i, j in np.ndindex(3, 3):
+        step = np.zeros((3, 3))
+        step[i, j] = 1e-6
+        expected[:, i, j] = (value(matrices + step) - value(matrices - step)) / 2e-6
+
+    def summed(m):
+        return jnp.sum(jnp.asarray(weights, jnp.float32) * rotations.to_matrix(rotations.nearest(m)))
+
+    found = jax.jit(jax.grad(summed))(jnp.asarray(matrices, jnp.float32))
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+    # A plane, a line and nothing leave turns open: their gradients are finite.
+    flat = jnp.stack([jnp.diag(jnp.array(x)) for x in ([1.0, 1, 0], [1.0, 0, 0], [0.0, 0, 0])])
+    assert np.isfinite(jax.grad(lambda m: jnp.sum(rotations.nearest(m)))(flat)).all()

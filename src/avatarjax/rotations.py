@@ -13,6 +13,8 @@ from jaxtyping import Array, Float
 _TINY = 1e-12
 # Squarings of a 4x4 matrix, after which its first eigenvector is all that is left of it.
 _SQUARINGS = 4
+# By which share of its size a matrix that leaves a turn open is taken to resist it.
+_HELD = 1e-4
 
 
 def normalize(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
@@ -67,11 +69,13 @@ def from_matrix(r: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
     return jnp.where(q[..., :1] < 0, -q, q)
 
 
+@jax.custom_jvp
 def nearest(matrices: Float[Array, "n 3 3"]) -> Float[Array, "n 4"]:
     """Unit quaternions of the rotations nearest to matrices of positive determinant, in the sense of least squares.
 
     They are the eigenvectors to the largest eigenvalues of symmetric 4x4 matrices (Davenport's solution of Wahba's
     problem, Keat 1977), which repeated squaring brings out: a batched SVD takes a hundred times as long on a CPU.
+    Derivatives are those of the polar decomposition, held back where a matrix leaves the rotation all but open.
     """
     size = jnp.sqrt(jnp.mean(jnp.sum(matrices**2, axis=-1), axis=-1))
     m = matrices / jnp.maximum(size, _TINY)[:, None, None]
@@ -85,6 +89,33 @@ def nearest(matrices: Float[Array, "n 3 3"]) -> Float[Array, "n 4"]:
         k = k / jnp.trace(k, axis1=-2, axis2=-1)[:, None, None]
     best = jnp.argmax(jnp.diagonal(k, axis1=-2, axis2=-1), axis=-1)
     return normalize(jnp.take_along_axis(k, best[:, None, None], axis=1)[:, 0])
+
+
+@nearest.defjvp
+def _nearest_jvp(
+    primals: tuple[Float[Array, "n 3 3"]], tangents: tuple[Float[Array, "n 3 3"]]
+) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"]]:
+    """Of M = R S, S symmetric: dR = R [w], where (tr S - S) w is the axis of R^T dM - dM^T R."""
+    quats = nearest(*primals)
+    turn = to_matrix(quats)
+    size = jnp.maximum(jnp.sqrt(jnp.sum(primals[0] ** 2, axis=(-2, -1))), _TINY)[:, None, None]
+
+    def aligned(matrices):
+        return jnp.sum(turn[:, :, :, None] * matrices[:, :, None] / size[..., None], axis=1)
+
+    s, change = aligned(primals[0]), aligned(tangents[0])
+    trace = (1 + _HELD) * (s[:, 0, 0] + s[:, 1, 1] + s[:, 2, 2])
+    a, b, c = (trace - s[:, k, k] for k in range(3))
+    d, e, f = (-(s[:, i, j] + s[:, j, i]) / 2 for i, j in ((1, 2), (0, 2), (0, 1)))
+    # The inverse of [[a, f, e], [f, b, d], [e, d, c]] is that of its cofactors.
+    first = [b * c - d * d, d * e - f * c, f * d - b * e]
+    others = [a * c - e * e, e * f - a * d, a * b - f * f]
+    determinant = jnp.maximum(a * first[0] + f * first[1] + e * first[2], _TINY)
+    inverse = [first, [first[1], *others[:2]], [first[2], *others[1:]]]
+    axis = [change[:, i, j] - change[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))]
+    turning = [sum(x * y for x, y in zip(row, axis, strict=True)) for row in inverse]
+    half = jnp.stack([jnp.zeros_like(determinant), *turning], axis=-1) / (2 * determinant[:, None])
+    return quats, multiply(quats, half)
 
 
 def nlerp(a: Float[Array, "*b 4"], b: Float[Array, "*b 4"], weight: Float[Array, "*b"] | float) -> Float[Array, "*b 4"]:

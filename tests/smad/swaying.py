@@ -61,7 +61,7 @@ def take(frames=30, size=48, bend=0.0, skeleton=True, period=15.0, cloud=None):
     cloud = doll() if cloud is None else cloud
     camera = cameras.look_at((0.5, 1.3, 3.2), PLACE, width=size, height=size, fov_y=0.42)
     told = poses(frames, bend, skeleton=True)
-    skin = jax.jit(skeletal.bind)(skeletal.rig_of(told), pose(told, 0), cloud.means)
+    skin = skeletal.bind(skeletal.rig_of(told), pose(told, 0), cloud.means)
 
     @jax.jit
     def shot(pose, frame):

@@ -13,7 +13,7 @@ from tests.smad import swaying
 
 # Compiled as a whole these are faster, also for a single call.
 nodes, move, offsets = map(jax.jit, (warps.nodes, warps.move, warps.offsets))
-pose_points, bind = jax.jit(skeletal.pose_points), jax.jit(skeletal.bind)
+pose_points = jax.jit(skeletal.pose_points)
 CLOUD = swaying.doll(80)
 NET = graph.of_gaussians(CLOUD, graph.GraphConfig(40, 6))
 
@@ -44,7 +44,7 @@ def test_without_a_skeleton_nothing_moves_before_training():
 
 def test_with_a_skeleton_it_is_skinning_before_training():
     warp, rig, poses = skinned()
-    skin = bind(rig, jax.tree.map(lambda x: x[1], poses), warp.graph.positions)
+    skin = skeletal.bind(rig, jax.tree.map(lambda x: x[1], poses), warp.graph.positions)
     for frame in range(5):
         expected = pose_points(skin, jax.tree.map(lambda x, k=frame: x[k], poses))
         np.testing.assert_allclose(nodes(warp, frame), expected, atol=2e-6)

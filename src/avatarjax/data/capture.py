@@ -20,7 +20,7 @@ from avatarjax.cameras import Camera
 from avatarjax.data import dressing
 from avatarjax.data.body import Rig
 from avatarjax.data.importers.monocular import Poses, write_monocular
-from avatarjax.data.mesh_renderer import MeshRenderer
+from avatarjax.data.mesh_renderer import MeshRenderer, PosedMesh
 from avatarjax.data.motion.locomotion import Motion
 from avatarjax.data.wardrobe.assembly import AvatarMesh
 from avatarjax.io import weights
@@ -118,8 +118,8 @@ def _shoot(
     camera = following_camera(np.asarray(motion.roots), size)
     renderer = MeshRenderer(avatar.faces, avatar.uvs, avatar.texture)
     shots = []
-    for k, posed in enumerate(vertices):
-        shots.append(photograph(renderer, posed, jax.tree.map(lambda x, k=k: x[k], camera)))
+    for k, frame in enumerate(vertices):
+        shots.append(photograph(renderer.pose(frame), jax.tree.map(lambda x, k=k: x[k], camera)))
         if progress:
             progress(1)
     new = folder.with_name(f".{folder.name}.new")
@@ -132,11 +132,9 @@ def _shoot(
     new.rename(folder)
 
 
-def photograph(
-    renderer: MeshRenderer, vertices: Float[np.ndarray, "v 3"], camera: Camera
-) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+def photograph(mesh: PosedMesh, camera: Camera) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """A picture of the mesh before a plain wall, and the mask of what is not the wall."""
-    rgba = renderer.render(vertices, camera)
+    rgba = mesh.render(camera)
     alpha = rgba[..., 3:].astype(np.float32) / 255
     picture = np.round(rgba[..., :3] * alpha + 255 * _BACKGROUND * (1 - alpha)).astype(np.uint8)
     return picture, rgba[..., 3] > 127

@@ -6,6 +6,7 @@ is skinned so follows the thighs at once and splits between them (SMAD 1, Fig. 1
 
 from __future__ import annotations
 
+import functools
 import typing
 
 import flax.struct
@@ -50,6 +51,7 @@ def bones(rig: Rig, pose: Pose) -> Float[Array, "j 3 4"]:
     return skinning.forward_kinematics(rig, rotations.from_matrix(turns), jnp.zeros(3))
 
 
+@functools.partial(jax.jit, static_argnames="sharpness")
 def bind(rig: Rig, pose: Pose, points: Float[Array, "n 3"], sharpness: float = 4.0) -> Skin:
     """Bind points that lie in the body frame of a pose, metres.
 
