@@ -52,7 +52,7 @@ METHODS: dict[str, tuple[Callable[[SmadConfig], SmadConfig] | None, float | None
 # The long sequences of Table 5, and what the paper calls them.
 LONG = {("keys", 0): "dynamic pose", ("run", 0): "repetitive pose"}
 # Rollouts are learned from for so many times the steps of the preset, which has few.
-LONGER = 4
+LONGER = 10
 # Frames of one second are alike: intervals are over pieces of a take of so many frames.
 PIECE = 30
 

@@ -204,7 +204,7 @@ def _ci() -> SmadConfig:
             stage=StageConfig(300, 4, 5e-4),
         ),
         pictures=PicturesConfig(
-            drape_stage=StageConfig(4_000, 2, 2e-3), swing_stage=StageConfig(100, 4, 3e-4), frames=8, drawn=2
+            drape_stage=StageConfig(4_000, 2, 2e-3), swing_stage=StageConfig(40, 4, 3e-4), frames=8, drawn=2
         ),
     )
 

@@ -180,21 +180,27 @@ def loss(
     """
     refined = _assemble(params, batch.warp)
     background = jax.random.uniform(key, (3,))
-    clouds = jax.vmap(lambda frame: warps.move(refined.warp, refined.gaussians, frame))(batch.frames)
-
-    def draw(view):
-        out = render(*view, background=background, config=splat)
-        return out.image, out.alpha, out.info.dropped
-
-    images, alphas, dropped = jax.lax.map(draw, (clouds, batch.cameras))
-    photometric = l1(images, footage.over(batch.rgba, background))
-    silhouette = l1(alphas[..., None], batch.rgba[..., 3:].astype(jnp.float32) / 255)
     rest = _lengths(refined.gaussians.means, batch.edges)
-    stretch = (jax.vmap(_lengths, in_axes=(0, None))(clouds.means, batch.edges) - rest[None]) / jnp.mean(rest)
-    away = jax.vmap(lambda frame: warps.offsets(refined.warp, frame))(batch.frames)
-    regular = {"silhouette": silhouette, "isometry": jnp.mean(stretch**2), "offset": jnp.mean(away**2)}
-    value = photometric + sum(getattr(config, name) * term for name, term in regular.items())
-    return value, {"photometric": photometric, **regular, "dropped": jnp.sum(dropped).astype(jnp.float32)}
+
+    def terms(view):
+        frame, camera, rgba = view
+        cloud = warps.move(refined.warp, refined.gaussians, frame)
+        out = render(cloud, camera, background=background, config=splat)
+        stretch = (_lengths(cloud.means, batch.edges) - rest) / jnp.mean(rest)
+        return {
+            "photometric": l1(out.image, footage.over(rgba, background)),
+            "silhouette": l1(out.alpha[..., None], rgba[..., 3:].astype(jnp.float32) / 255),
+            "isometry": jnp.mean(stretch**2),
+            "offset": jnp.mean(warps.offsets(refined.warp, frame) ** 2),
+            "dropped": jnp.sum(out.info.dropped).astype(jnp.float32),
+        }
+
+    # One frame after the other, with all that is its own: a batch of scatters is slow on a CPU.
+    found = jax.lax.map(terms, (batch.frames, batch.cameras, batch.rgba))
+    dropped = jnp.sum(found.pop("dropped"))
+    means = {name: jnp.mean(values) for name, values in found.items()}
+    weighted = [getattr(config, name) * means[name] for name in ("silhouette", "isometry", "offset")]
+    return means["photometric"] + sum(weighted), means | {"dropped": dropped}
 
 
 def at(refined: Refined, take: int, frame: int) -> Gaussians:

@@ -10,6 +10,7 @@ everything, through rollouts (Eq. 10), which begin in frames as if the clothes h
 from __future__ import annotations
 
 import typing
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -53,13 +54,11 @@ def train_drape(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
         fixed, recorded = batch["avatar"], batch["recorded"]
         gaussians = _with_look(fixed.gaussians, params["look"])
 
-        def one(frame):
+        def shown(frame):
             nodes, offset = _at(fixed.replace(params=params["dynamics"]), recorded, frame)
-            cloud = embedded.carry(fixed.binding, gaussians, fixed.system.graph, nodes)
-            return cloud, nodes, offset
+            return embedded.carry(fixed.binding, gaussians, fixed.system.graph, nodes), nodes, offset
 
-        clouds, nodes, offsets = jax.vmap(one)(batch["frames"])
-        return _total(avatar, key, batch, splat, clouds, nodes, offsets)
+        return _total(avatar, key, batch, splat, shown, batch["frames"])
 
     encoded = refine.encode(avatar.gaussians)
     start = {"dynamics": avatar.params, "look": {name: encoded[name] for name in LOOK}}
@@ -91,12 +90,15 @@ def train_swing(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
         def one(start):
             state = train_dynamics.calm_at(config, params, fixed.system, batch["recorded"], start)
             states, looks = train_dynamics.roll(config, params, fixed.system, batch["recorded"], state, start, frames)
-            states, looks = jax.tree.map(lambda x: x[drawn], (states, looks))
-            nodes = jax.vmap(lambda state: dynamics.positions(fixed.system, state))(states)
-            return jax.vmap(smad.dressed, in_axes=(None, 0, 0))(fixed, nodes, looks), nodes, states.offset
+            return jax.tree.map(lambda x: x[drawn], (states, looks))
 
-        clouds, nodes, offsets = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(one)(batch["start"]))
-        return _total(avatar, key, batch, splat, clouds, nodes, offsets)
+        def shown(found):
+            state, look = found
+            nodes = dynamics.positions(fixed.system, state)
+            return smad.dressed(fixed, nodes, look), nodes, state.offset
+
+        found = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(one)(batch["start"]))
+        return _total(avatar, key, batch, splat, shown, found)
 
     hold = train_dynamics.hold_equilibrium(config)
     params = train_stage(run, "swing", settings.swing_stage, config, loss, avatar.params, batch_at, hold)
@@ -169,41 +171,42 @@ def _total(
     key: Array,
     batch: dict[str, typing.Any],
     splat: SplatConfig,
-    clouds: Gaussians,
-    nodes: Float[Array, "k n 3"],
-    offsets: Float[Array, "k n 3"],
+    shown: Callable[[typing.Any], tuple[Gaussians, Float[Array, "n 3"], Float[Array, "n 3"]]],
+    found: typing.Any,
 ) -> tuple[Float[Array, ""], Metrics]:
     """Mean absolute errors of colours and alphas over a background that is drawn anew, mean squared stretch of edges in
     units of their mean length (Eq. 11), and the mean square of offsets in metres; those two choose among all motions
-    that look alike to one camera."""
+    that look alike to one camera. `shown` says of each of what was `found` the cloud, the nodes and their offsets."""
     settings, graph = avatar.config.pictures, batch["avatar"].system.graph
     background = jax.random.uniform(key, (3,))
-
-    def draw(view):
-        cloud, camera, rgba = view
-        out = render(cloud, camera, background=background, config=splat)
-        silhouette = l1(out.alpha[..., None], rgba[..., 3:].astype(jnp.float32) / 255)
-        return l1(out.image, footage.over(rgba, background)), silhouette, out.info.dropped
-
-    photometric, silhouette, dropped = jax.lax.map(draw, (clouds, batch["cameras"], batch["rgba"]))
-    counts = batch.get("counts", jnp.ones(len(photometric))).astype(jnp.float32)
-    share = counts / jnp.maximum(jnp.sum(counts), 1.0)
     i, j = graph.edges.T
 
     def lengths(points):
         return jnp.sqrt(jnp.sum((jnp.take(points, i, axis=0) - points[j]) ** 2, axis=-1) + 1e-12)
 
     rest = lengths(graph.positions)
-    stretch = (jax.vmap(lengths)(nodes) - rest[None]) / jnp.mean(rest)
-    terms = {
-        "photometric": jnp.sum(share * photometric),
-        "silhouette": jnp.sum(share * silhouette),
-        "isometry": jnp.mean(stretch**2),
-        "offset": jnp.mean(offsets**2),
-    }
+
+    def terms(view):
+        (cloud, nodes, offsets), camera, rgba = shown(view[0]), *view[1:]
+        out = render(cloud, camera, background=background, config=splat)
+        return {
+            "photometric": l1(out.image, footage.over(rgba, background)),
+            "silhouette": l1(out.alpha[..., None], rgba[..., 3:].astype(jnp.float32) / 255),
+            "isometry": jnp.mean(((lengths(nodes) - rest) / jnp.mean(rest)) ** 2),
+            "offset": jnp.mean(offsets**2),
+            "dropped": jnp.sum(out.info.dropped).astype(jnp.float32),
+        }
+
+    # One frame after the other, with all that is its own: a batch of scatters is slow on a CPU.
+    each = jax.lax.map(terms, (found, batch["cameras"], batch["rgba"]))
+    counts = batch.get("counts", jnp.ones(len(each["photometric"]))).astype(jnp.float32)
+    share = {name: counts / jnp.maximum(jnp.sum(counts), 1.0) for name in ("photometric", "silhouette")}
+    alike = jnp.full(len(counts), 1 / len(counts))
+    dropped = jnp.sum(each.pop("dropped"))
+    means = {name: jnp.sum(share.get(name, alike) * values) for name, values in each.items()}
     weights = {"photometric": 1.0} | {k: getattr(settings, k) for k in ("silhouette", "isometry", "offset")}
-    value = jnp.sum(jnp.stack([weights[name] * term for name, term in terms.items()]))
-    return value, terms | {"dropped": jnp.sum(dropped).astype(jnp.float32)}
+    value = jnp.sum(jnp.stack([weights[name] * term for name, term in means.items()]))
+    return value, means | {"dropped": dropped}
 
 
 def _recorded(avatar: Avatar, takes: Footage) -> Recorded:
