@@ -128,8 +128,8 @@ class DynamicsConfig:
 class PicturesConfig:
     """How they are learned from pictures. All but the photometric loss (Eq. 10) is ours.
 
-    drape_stage: of the equilibrium and the look, in frames; swing_stage: of all, in rollouts of so many `frames`, of
-    each of which so many are `drawn`. silhouette, isometry, offset: weights beside the photometric error.
+    drape_stage: of the equilibrium and the Gaussians, in frames; swing_stage: of the dynamics, in rollouts of so many
+    `frames`, of each of which so many are `drawn`. silhouette, isometry, offset: weights beside the photometric error.
     """
 
     drape_stage: StageConfig = StageConfig(20_000, 2, 2e-3)

@@ -1,6 +1,6 @@
 """Learning how clothes hang and swing from the pictures themselves (SMAD 3.2, Eqs. 9 to 11).
 
-First `train_drape`: the equilibrium, which is what a window of poses alone says, and the Gaussians' look, from single
+First `train_drape`: the equilibrium, which is what a window of poses alone says, and the Gaussians, from single
 frames. All frames share it, so that a side that one frame hides is learned from others in which the person stood
 otherwise; tracks (`refine`), which belong to one frame each, are only where it starts from. Then `train_swing`:
 everything, through rollouts (Eq. 10), which begin in frames as if the clothes had always been at their equilibrium.
@@ -32,11 +32,13 @@ from avatarjax.splat import SplatConfig, l1, render
 from avatarjax.train import Run, train_stage
 from avatarjax.train.state import Metrics
 
-LOOK = ("log_scales", "logit_opacities", "colors")  # what is learned of the Gaussians, beside where they are
+# Metres in which the Gaussians' canonical means are learned: a stage has one rate, for numbers of unit size.
+_UNIT = 0.125
 
 
 def train_drape(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
-    """The avatar with an equilibrium, colours, sizes and opacities that look like the pictures.
+    """The avatar with an equilibrium and Gaussians that look like the pictures: Gaussians that were fitted to motion of
+    each frame's own (`refine`) are learned on, places and all, for what the equilibrium says.
 
     Frames that are held out are not drawn. Raises ValueError where the avatar has no equilibrium to learn.
     """
@@ -60,8 +62,7 @@ def train_drape(avatar: Avatar, takes: Footage, run: Run) -> Avatar:
 
         return _total(avatar, key, batch, splat, shown, batch["frames"])
 
-    encoded = refine.encode(avatar.gaussians)
-    start = {"dynamics": avatar.params, "look": {name: encoded[name] for name in LOOK}}
+    start = {"dynamics": avatar.params, "look": _look(avatar.gaussians)}
     trained = train_stage(run, "drape", settings.drape_stage, config, loss, start, batch_at)
     params = trained["dynamics"]
     system = train_dynamics.knowing(config, params, avatar.system, recorded)
@@ -229,8 +230,16 @@ def _views(takes: Footage, frames: Int[np.ndarray, " k"]) -> dict[str, typing.An
     return {"cameras": cameras, "rgba": takes.rgba[frames]}
 
 
+def _look(gaussians: Gaussians) -> Params:
+    """What is learned of the Gaussians."""
+    encoded = refine.encode(gaussians)
+    return encoded | {"means": encoded["means"] / _UNIT}
+
+
 def _with_look(gaussians: Gaussians, look: Params) -> Gaussians:
-    return refine.decode(refine.encode(gaussians) | look)
+    """The Gaussians with what was learned of them, or with a part of it."""
+    learned = _look(gaussians) | look
+    return refine.decode(learned | {"means": _UNIT * learned["means"]})
 
 
 def _room(avatar: Avatar, takes: Footage) -> SplatConfig:
