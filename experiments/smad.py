@@ -116,7 +116,8 @@ def run_experiment(args: Args) -> Path:
     avatar, tracks = stage("dynamics", "training", lambda: learn(config, takes["train"], refined, run))
     files.save(folder / files.FILE, avatar)
     if last == len(STAGES) - 1:
-        stage("report", "measuring on other takes", lambda: smad_report.write(experiment, avatar, takes, tracks))
+        parts = experiment, avatar, takes, tracks, refined[0].gaussians
+        stage("report", "measuring on other takes", lambda: smad_report.write(*parts))
         print(f"[{time.monotonic() - began:6.1f} s] report: open {folder / 'report.html'}")
     return folder
 

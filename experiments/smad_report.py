@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from avatarjax import smad
 from avatarjax.data import MonocularVideo, avatars
+from avatarjax.gaussians import Gaussians
 from avatarjax.io import atomic, exr, video
 from avatarjax.metrics import lpips, pretrained
 from avatarjax.metrics.report import Report
@@ -32,11 +33,16 @@ PARTS = {
 
 
 def write(
-    experiment: Experiment, avatar: smad.Avatar, takes: dict[str, list[MonocularVideo]], tracks: list[Take]
+    experiment: Experiment,
+    avatar: smad.Avatar,
+    takes: dict[str, list[MonocularVideo]],
+    tracks: list[Take],
+    fitted: Gaussians,
 ) -> None:
     """Measure the avatar on all takes, and write metrics.json, videos, contact sheets and report.html.
 
-    `tracks` are those of the takes that it learned from: how good the fit is that dynamics can only come near to.
+    `tracks` are those of the takes that it learned from, and `fitted` the Gaussians before they were learned on: how
+    good the fit is that dynamics can only come near to.
     """
     folder = experiment.folder
     perceptual = lpips.load("alex") if pretrained.available("alex") else None
@@ -58,7 +64,7 @@ def write(
     for part, take, truth in tqdm(measured, desc="measuring", unit="take"):
         moved = measures.move(avatar, driving.recorded(take.poses))
         if take.folder in fits:
-            moved["tracks"] = measures.follow(avatar, fits[take.folder])
+            moved["tracks"] = measures.follow(avatar.replace(gaussians=fitted), fits[take.folder])
         name = f"{part} {take.folder.name}"
         recorded = measures.recorded_view(take)
         results[name] = {"pictures": measures.picture_errors([recorded], moved, perceptual)}
@@ -99,8 +105,8 @@ def page(experiment: Experiment, avatar: smad.Avatar, results, shown, learned: i
         f"{len(avatar.gaussians)} Gaussians on {len(avatar.system.graph.positions)} nodes, learned from "
         f"{learned} takes of one camera, the first of them a slow turn. Each method drives the same Gaussians: "
         "ours by the learned mass-spring-damper system, the second by what a window of poses alone says, the third by "
-        "linear blend skinning; tracks are what was fitted to the pictures of a take itself, which the others learned "
-        "from and cannot beat by much."
+        "linear blend skinning; tracks, with Gaussians of their own, are what was fitted to the pictures of a take "
+        "itself, which the others learned from and cannot beat by much."
     )
     for part in ("test", "unseen"):
         if shown.get(part):
