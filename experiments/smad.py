@@ -180,7 +180,8 @@ def filmed(folder: Path, avatar: str, names: Sequence[Name], wanted: FilmConfig)
 
 def keep_films(folder: Path, wanted: FilmConfig) -> None:
     """Films of other settings are deleted, with a word; those of the same are kept."""
-    settings, path = json.dumps({"size": wanted.size, "substeps": wanted.substeps}), folder / "settings.json"
+    settings = json.dumps({"size": wanted.size, "substeps": wanted.substeps, "edges": "mattes"})
+    path = folder / "settings.json"
     if folder.exists() and (not path.is_file() or path.read_text() != settings):
         print(f"deleting films of other settings in {folder}")
         shutil.rmtree(folder)
@@ -192,7 +193,7 @@ def fingerprint(takes: Sequence[MonocularVideo]) -> str:
     """What tells these takes from others."""
     mark = hashlib.sha256()
     for take in takes:
-        mark.update(np.ascontiguousarray(take.masks))
+        mark.update(np.ascontiguousarray(take.masks if take.mattes is None else take.mattes))
         mark.update(np.ascontiguousarray(take.poses.rotations))
         mark.update(np.ascontiguousarray(take.images()[::10]))
     return mark.hexdigest()[:12]

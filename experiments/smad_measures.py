@@ -83,8 +83,7 @@ def recorded_view(take: MonocularVideo) -> View:
     """What the camera that filmed saw."""
 
     def at(frame):
-        inside = take.masks[frame]
-        return take.camera_at(frame), over_black(take.images()[frame], inside), inside
+        return take.camera_at(frame), over_black(take.images()[frame], take.coverage(frame)), take.masks[frame]
 
     return View(len(take), at)
 
@@ -108,8 +107,8 @@ def novel_views(take: MonocularVideo, texture: UInt8[np.ndarray, "h w 3"]) -> li
 
         def at(frame):
             camera = jax.tree.map(lambda x: x[frame], cameras)
-            picture, inside = capture.photograph(mesh(frame), camera)
-            return camera, over_black(picture, inside), inside
+            picture, matte = capture.photograph(mesh(frame), camera)
+            return camera, over_black(picture, matte), matte > 127
 
         return View(len(take), at)
 
@@ -153,9 +152,9 @@ def picture_values(
     return values
 
 
-def over_black(picture: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"]) -> jax.Array:
-    """A picture (h, w, 3) in 0..1 with what is not inside the mask black."""
-    return jnp.asarray(picture / 255 * inside[..., None], jnp.float32)
+def over_black(picture: UInt8[np.ndarray, "h w 3"], coverage: UInt8[np.ndarray, "h w"]) -> jax.Array:
+    """A picture (h, w, 3) in 0..1 with what is not the person black."""
+    return jnp.asarray(picture / 255 * (coverage[..., None] / 255), jnp.float32)
 
 
 def draw(gaussians: Gaussians, camera: Camera) -> jax.Array:

@@ -9,6 +9,7 @@ import pytest
 
 from avatarjax import cameras
 from avatarjax.data import capture
+from avatarjax.data.mesh_renderer import MeshRenderer
 
 PATH = np.stack([np.linspace(0, 3, 40), np.ones(40), np.linspace(0, -2, 40)], axis=1)
 
@@ -23,6 +24,18 @@ def test_a_camera_follows_on_its_side_and_looks_at_the_figure(azimuth, side):
         np.testing.assert_allclose(away[[0, 2]] / np.linalg.norm(away[[0, 2]]), side, atol=0.3)
         seen = np.asarray(cameras.project(camera, jnp.asarray(PATH[frame : frame + 1], jnp.float32))[0])[0]
         assert (np.abs(seen[:2] - 32) < 12).all()
+
+
+def test_a_photograph_has_the_colour_of_the_mesh_alone_wherever_there_is_any():
+    corners = np.array([[-0.5, 0, 0], [0.5, 0.1, 0], [0, 1.2, 0]], np.float32)
+    grey = np.full((2, 2, 3), 90, np.uint8)
+    mesh = MeshRenderer(np.array([[0, 1, 2]]), np.full((1, 3, 2), 0.5, np.float32), grey).pose(corners)
+    camera = cameras.look_at((0.0, 0.6, 3.0), (0.0, 0.6, 0.0), width=24, height=24)
+    picture, matte = capture.photograph(mesh, camera)
+    assert ((matte > 0) & (matte < 255)).any(), "no pixel at the edge is covered in part"
+    inside = picture[matte == 255]
+    np.testing.assert_allclose(picture[matte > 0], np.broadcast_to(inside[0], picture[matte > 0].shape), atol=2)
+    assert (picture[matte == 0] == picture[0, 0]).all() and (picture[0, 0] != inside[0]).all()
 
 
 def test_the_next_take_is_made_while_one_is_used_and_a_failure_loses_none_before_it():

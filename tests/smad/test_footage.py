@@ -21,6 +21,10 @@ def test_pictures_are_kept_as_they_are_inside_of_the_mask(film):
     takes = footage.gather([film])
     np.testing.assert_array_equal(takes.rgba[..., 3], 255 * film.masks)
     np.testing.assert_array_equal(takes.rgba[..., :3], film.images() * film.masks[..., None])
+    half = dataclasses.replace(film, mattes=np.where(film.masks, 128, 0).astype(np.uint8))
+    rgba = footage.gather([half]).rgba
+    np.testing.assert_array_equal(rgba[..., 3], half.mattes)
+    np.testing.assert_allclose(rgba[..., :3], film.images() * (half.mattes[..., None] / 255), atol=0.51)
     assert takes.rgba.dtype == np.uint8 and takes.takes == (8,) and takes.rig is None
 
 

@@ -54,7 +54,9 @@ def video(shape=ellipsoid, frames=24, size=64, sway=0.0, empty=False):
     poses = Poses(
         np.tile(np.eye(3, dtype=np.float32), (frames, 1, 1, 1)), np.float32(turns), np.float32(places), ("root",), (-1,)
     )
-    return MonocularVideo(Path("."), np.stack(masks), camera, poses, 30.0, lambda: iter(images), np.stack(images))
+    return MonocularVideo(
+        Path("."), np.stack(masks), camera, poses, 30.0, lambda: iter(images), _loaded=np.stack(images)
+    )
 
 
 def moving_camera(film):
@@ -64,4 +66,4 @@ def moving_camera(film):
     camera = film.camera.replace(
         world_to_camera=tile(film.camera.world_to_camera), intrinsics=tile(film.camera.intrinsics)
     )
-    return MonocularVideo(film.folder, film.masks, camera, film.poses, film.fps, film.decode, film.images())
+    return MonocularVideo(film.folder, film.masks, camera, film.poses, film.fps, film.decode, _loaded=film.images())

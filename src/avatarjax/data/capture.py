@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from scipy import ndimage
 
 from avatarjax import cameras, rotations
@@ -29,7 +29,7 @@ from avatarjax.physics.xpbd import XPBDConfig
 MESHES = "meshes.safetensors"
 # Frames over which the operator smooths the path that the camera follows.
 _STEADINESS = 10.0
-_BACKGROUND = 0.93
+_WALL = 237  # its brightness
 
 
 class Take(typing.NamedTuple):
@@ -124,17 +124,16 @@ def _shoot(
             progress(1)
     new = folder.with_name(f".{folder.name}.new")
     shutil.rmtree(new, ignore_errors=True)
-    images, masks = zip(*shots, strict=True)
-    write_monocular(new, list(images), list(masks), camera, poses_of(avatar.rig, motion))
+    images, mattes = zip(*shots, strict=True)
+    write_monocular(new, list(images), list(mattes), camera, poses_of(avatar.rig, motion))
     relative = (vertices - np.asarray(motion.hips)[:, None]).astype(np.float16)
     weights.save_tree(new / MESHES, {"vertices": relative, "faces": avatar.faces, "uvs": avatar.uvs})
     shutil.rmtree(folder, ignore_errors=True)
     new.rename(folder)
 
 
-def photograph(mesh: PosedMesh, camera: Camera) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """A picture of the mesh before a plain wall, and the mask of what is not the wall."""
+def photograph(mesh: PosedMesh, camera: Camera) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
+    """A picture of the mesh cut out before a plain wall, and its matte: how much of each pixel it covers, 0 to 255.
+    Where it covers some the picture has its colour alone, so that no light of the wall counts as its own."""
     rgba = mesh.render(camera)
-    alpha = rgba[..., 3:].astype(np.float32) / 255
-    picture = np.round(rgba[..., :3] * alpha + 255 * _BACKGROUND * (1 - alpha)).astype(np.uint8)
-    return picture, rgba[..., 3] > 127
+    return np.where(rgba[..., 3:] > 0, rgba[..., :3], np.uint8(_WALL)), rgba[..., 3]

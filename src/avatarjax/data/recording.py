@@ -37,6 +37,10 @@ class Poses:
 class MonocularVideo:
     """f frames of one person: masks (f, h, w), a camera (one, or a batch of f), poses, and RGB frames.
 
+    mattes (f, h, w) uint8 say how much of each pixel the person covers, where that is known; the frames then show the
+    person's own colour wherever there is any of it. Without them a pixel at an edge is the person's or not, and mixed
+    with what is behind.
+
     Iterate over `frames()` to decode one (h, w, 3) uint8 image at a time; `images()` holds all of them. `decode()`
     begins to read them from their files.
     """
@@ -47,6 +51,7 @@ class MonocularVideo:
     poses: Poses
     fps: float
     decode: Callable[[], Iterator[np.ndarray]]
+    mattes: np.ndarray | None = None
     _loaded: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -59,6 +64,10 @@ class MonocularVideo:
     def images(self) -> UInt8[np.ndarray, "f h w 3"]:
         """All RGB frames at once."""
         return self._loaded if self._loaded is not None else np.stack(list(self.frames()))
+
+    def coverage(self, frame: int) -> UInt8[np.ndarray, "h w"]:
+        """How much of each pixel of a frame the person covers, 0 to 255: all or nothing without mattes."""
+        return self.mattes[frame] if self.mattes is not None else np.where(self.masks[frame], 255, 0).astype(np.uint8)
 
     def camera_at(self, frame: int) -> Camera:
         """The camera of one frame."""
@@ -77,6 +86,7 @@ class MonocularVideo:
             )
         parts = {name: getattr(poses, name)[frames] for name in ("rotations", "root_rotation", "root_translation")}
         chosen = {"masks": self.masks[frames], "camera": camera, "poses": dataclasses.replace(poses, **parts)}
+        chosen["mattes"] = None if self.mattes is None else self.mattes[frames]
         return dataclasses.replace(self, **chosen, _loaded=self.images()[frames])
 
     def held(self) -> MonocularVideo:

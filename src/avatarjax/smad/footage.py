@@ -109,8 +109,9 @@ def _decode(take: int, video: MonocularVideo, shrink: int) -> UInt8[np.ndarray, 
     count = 0
     for count, frame in enumerate(video.frames(), start=1):
         if count <= len(video):
-            mask = video.masks[count - 1][..., None].astype(np.uint8)
-            pictures[count - 1] = _shrunk(np.concatenate([frame * mask, 255 * mask], axis=-1), shrink)
+            alpha = video.coverage(count - 1)[..., None]
+            premultiplied = np.round(frame * (alpha / np.float32(255))).astype(np.uint8)
+            pictures[count - 1] = _shrunk(np.concatenate([premultiplied, alpha], axis=-1), shrink)
     if count != len(video):
         raise ValueError(f"take {take} has {count} pictures and {len(video)} masks: give one for each frame")
     return pictures

@@ -55,7 +55,7 @@ class TexelHead(nnx.Module):
         x = features
         for layer in self.layers:
             kernel = layer.kernel[...].reshape(9, x.shape[1], -1)
-            x = jax.nn.silu(posmap.convolve(neighbours, x, kernel) + layer.bias[...][None])
+            x = jax.nn.silu(posmap.convolve(neighbours, x, kernel) + jnp.asarray(layer.bias)[None])
         return self.leave(x)
 
 

@@ -140,6 +140,16 @@ def recording(frames=5, moving=False, width=48, height=32):
     return images, masks, camera, Poses(rotations, turns, path, ("hips", "spine"), (-1, 0), joints)
 
 
+def test_mattes_round_trip_and_masks_are_what_they_cover_half(tmp_path):
+    images, _, camera, poses = recording()
+    mattes = np.random.default_rng(0).integers(0, 256, np.shape(images)[:3]).astype(np.uint8)
+    data.write_monocular(tmp_path / "take", images, mattes, camera, poses)
+    loaded = data.load_monocular(tmp_path / "take")
+    np.testing.assert_array_equal(loaded.mattes, mattes)
+    np.testing.assert_array_equal(loaded.masks, mattes > 127)
+    np.testing.assert_array_equal(loaded.only(np.array([3, 1])).coverage(0), mattes[3])
+
+
 @pytest.mark.parametrize("moving", [False, True], ids=["one camera", "a camera a frame"])
 @pytest.mark.parametrize("as_video", [False, True], ids=["images", "video"])
 def test_a_monocular_folder_round_trips(tmp_path, moving, as_video):
@@ -151,6 +161,7 @@ def test_a_monocular_folder_round_trips(tmp_path, moving, as_video):
         assert len(loaded) == 5 and loaded.fps == 25
         np.testing.assert_allclose(loaded.images(), images, atol=8 if as_video else 0)
         np.testing.assert_array_equal(loaded.masks, masks)
+        assert loaded.mattes is None and (loaded.coverage(2) == 255 * np.asarray(masks[2])).all()
         np.testing.assert_allclose(loaded.camera.world_to_camera, camera.world_to_camera, atol=1e-6)
         np.testing.assert_allclose(loaded.camera_at(3).intrinsics.shape, (3, 3))
         np.testing.assert_array_equal(loaded.poses.rotations, poses.rotations)

@@ -58,7 +58,8 @@ def _load(folder: Path) -> MonocularVideo:
                              "cameras.json and poses.npz")  # fmt: skip
     camera = _read_cameras(folder / CAMERAS)
     poses = _read_poses(folder / POSES)
-    masks = np.stack([_read_mask(path, camera) for path in _pictures(folder / MASKS)])
+    mattes = np.stack([_read_matte(path, camera) for path in _pictures(folder / MASKS)])
+    masks = mattes > 127
     count, fps = _count(folder)
     lengths = {"masks": len(masks), "poses": len(poses)}
     if camera.world_to_camera.ndim == 3:
@@ -66,13 +67,14 @@ def _load(folder: Path) -> MonocularVideo:
     for what, length in lengths.items():
         if length != count:
             raise ValueError(f"{folder} has {count} frames and {length} {what}: give one for each frame")
-    return MonocularVideo(folder, masks, camera, poses, fps, functools.partial(_decode, folder, camera))
+    soft = mattes if ((mattes > 0) & (mattes < 255)).any() else None
+    return MonocularVideo(folder, masks, camera, poses, fps, functools.partial(_decode, folder, camera), mattes=soft)
 
 
 def write_monocular(
     folder: str | os.PathLike,
     frames: Iterable[UInt8[np.ndarray, "h w 3"]],
-    masks: Iterable[Bool[np.ndarray, "h w"]],
+    masks: Iterable[Bool[np.ndarray, "h w"] | UInt8[np.ndarray, "h w"]],
     camera: Camera,
     poses: Poses,
     *,
@@ -81,6 +83,7 @@ def write_monocular(
 ) -> None:
     """Write a monocular folder, which appears whole or not at all; PNG frames without loss, or an H.264 video.
 
+    Masks are boolean, or mattes as `MonocularVideo` has them.
     Raises ValueError where the folder exists and is not empty, or the data do not count the same.
     """
     folder = Path(folder)
@@ -98,7 +101,8 @@ def write_monocular(
             for k, frame in enumerate(frames):
                 exr.write_png(temporary / IMAGES / f"{k:05d}.png", frame)
         for k, mask in enumerate(masks):
-            exr.write_png(temporary / MASKS / f"{k:05d}.png", np.where(mask, 255, 0).astype(np.uint8)[..., None])
+            matte = mask if mask.dtype == np.uint8 else 255 * mask.astype(np.uint8)
+            exr.write_png(temporary / MASKS / f"{k:05d}.png", matte[..., None])
         _write_cameras(temporary / CAMERAS, camera, fps)
         arrays: dict[str, np.ndarray] = {
             "rotations": poses.rotations,
@@ -170,11 +174,11 @@ def _decode(folder: Path, camera: Camera) -> Iterator[np.ndarray]:
             yield pixels
 
 
-def _read_mask(path: Path, camera: Camera) -> np.ndarray:
+def _read_matte(path: Path, camera: Camera) -> np.ndarray:
     pixels = exr.read_png(path)
     if pixels.shape[:2] != (camera.height, camera.width):
         raise ValueError(f"{path} has shape {pixels.shape[:2]}, {CAMERAS} says {(camera.height, camera.width)}")
-    return pixels[..., 0] > 127
+    return pixels[..., 0]
 
 
 def _json(path: Path) -> dict[str, typing.Any]:
