@@ -16,7 +16,7 @@ from avatarjax.data.recording import MonocularVideo
 from avatarjax.gaussians import Gaussians
 from avatarjax.smad import driving, skeletal, views
 from avatarjax.smad.driving import Pose
-from avatarjax.splat import SplatConfig, required_capacity
+from avatarjax.splat import RenderOutput, SplatConfig, l1, required_capacity
 
 # One frame of so many is never trained on, the third of each group.
 HELD_OUT, _WHICH = 5, 2
@@ -87,6 +87,18 @@ def over(rgba: UInt8[Array, "*b h w 4"], background: Float[Array, "3"]) -> Float
     """Pictures of the footage before a background, in 0..1."""
     shown = rgba.astype(jnp.float32) / 255
     return shown[..., :3] + (1 - shown[..., 3:]) * jnp.expand_dims(background, tuple(range(rgba.ndim - 1)))
+
+
+def missed(
+    out: RenderOutput, rgba: UInt8[Array, "h w 4"], background: Float[Array, "3"]
+) -> dict[str, Float[Array, ""]]:
+    """By how much what was drawn before a background misses a picture of the footage: `photometric` and `silhouette`,
+    mean absolute errors of colours and of alphas, and `dropped`, what the renderer had no room for."""
+    return {
+        "photometric": l1(out.image, over(rgba, background)),
+        "silhouette": l1(out.alpha[..., None], rgba[..., 3:].astype(jnp.float32) / 255),
+        "dropped": jnp.sum(out.info.dropped).astype(jnp.float32),
+    }
 
 
 def room(

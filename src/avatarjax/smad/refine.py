@@ -30,7 +30,7 @@ from avatarjax.smad.driving import Pose
 from avatarjax.smad.footage import Footage
 from avatarjax.smad.graph import Graph
 from avatarjax.smad.warp import Warp
-from avatarjax.splat import SplatConfig, l1, render
+from avatarjax.splat import SplatConfig, render
 from avatarjax.train import fit, make_step, new_state, weights
 from avatarjax.train.state import Metrics
 
@@ -180,20 +180,15 @@ def loss(
     """
     refined = _assemble(params, batch.warp)
     background = jax.random.uniform(key, (3,))
-    rest = _lengths(refined.gaussians.means, batch.edges)
+    rest = lengths(refined.gaussians.means, batch.edges)
 
     def terms(view):
         frame, camera, rgba = view
         cloud = warps.move(refined.warp, refined.gaussians, frame)
         out = render(cloud, camera, background=background, config=splat)
-        stretch = (_lengths(cloud.means, batch.edges) - rest) / jnp.mean(rest)
-        return {
-            "photometric": l1(out.image, footage.over(rgba, background)),
-            "silhouette": l1(out.alpha[..., None], rgba[..., 3:].astype(jnp.float32) / 255),
-            "isometry": jnp.mean(stretch**2),
-            "offset": jnp.mean(warps.offsets(refined.warp, frame) ** 2),
-            "dropped": jnp.sum(out.info.dropped).astype(jnp.float32),
-        }
+        stretch = (lengths(cloud.means, batch.edges) - rest) / jnp.mean(rest)
+        regular = {"isometry": jnp.mean(stretch**2), "offset": jnp.mean(warps.offsets(refined.warp, frame) ** 2)}
+        return footage.missed(out, rgba, background) | regular
 
     # One frame after the other, with all that is its own: a batch of scatters is slow on a CPU.
     found = jax.lax.map(terms, (batch.frames, batch.cameras, batch.rgba))
@@ -277,7 +272,7 @@ def _in_range(new: Params, old: Params, batch: FrameBatch) -> Params:
     return new | {"log_scales": jnp.clip(new["log_scales"], batch.range[0], batch.range[1])}
 
 
-def _lengths(points: Float[Array, "n 3"], edges: Int[Array, "e 2"]) -> Float[Array, " e"]:
+def lengths(points: Float[Array, "n 3"], edges: Int[Array, "e 2"]) -> Float[Array, " e"]:
     """Lengths of edges, differentiable where points coincide."""
     return jnp.sqrt(jnp.sum((points[edges[:, 0]] - points[edges[:, 1]]) ** 2, axis=-1) + 1e-12)
 

@@ -180,23 +180,14 @@ def _total(
     that look alike to one camera. `shown` says of each of what was `found` the cloud, the nodes and their offsets."""
     settings, graph = avatar.config.pictures, batch["avatar"].system.graph
     background = jax.random.uniform(key, (3,))
-    i, j = graph.edges.T
-
-    def lengths(points):
-        return jnp.sqrt(jnp.sum((jnp.take(points, i, axis=0) - points[j]) ** 2, axis=-1) + 1e-12)
-
-    rest = lengths(graph.positions)
+    rest = refine.lengths(graph.positions, graph.edges)
 
     def terms(view):
         (cloud, nodes, offsets), camera, rgba = shown(view[0]), *view[1:]
         out = render(cloud, camera, background=background, config=splat)
-        return {
-            "photometric": l1(out.image, footage.over(rgba, background)),
-            "silhouette": l1(out.alpha[..., None], rgba[..., 3:].astype(jnp.float32) / 255),
-            "isometry": jnp.mean(((lengths(nodes) - rest) / jnp.mean(rest)) ** 2),
-            "offset": jnp.mean(offsets**2),
-            "dropped": jnp.sum(out.info.dropped).astype(jnp.float32),
-        }
+        stretch = (refine.lengths(nodes, graph.edges) - rest) / jnp.mean(rest)
+        regular = {"isometry": jnp.mean(stretch**2), "offset": jnp.mean(offsets**2)}
+        return footage.missed(out, rgba, background) | regular
 
     # One frame after the other, with all that is its own: a batch of scatters is slow on a CPU.
     each = jax.lax.map(terms, (found, batch["cameras"], batch["rgba"]))
