@@ -157,7 +157,6 @@ def film(experiment: Experiment) -> dict[str, list[MonocularVideo]]:
             "train": [load_monocular(path).held() for path in args.videos],
             "test": [load_monocular(path).held() for path in args.test],
         }
-    keep_films(experiment.folder / "film", wanted)
     named = {part: getattr(wanted, part) for part in ("train", "test", "unseen")}
     found = filmed(experiment.folder / "film", args.avatar, [name for each in named.values() for name in each], wanted)
     return {part: [found[name] for name in names] for part, names in named.items()}
@@ -165,7 +164,8 @@ def film(experiment: Experiment) -> dict[str, list[MonocularVideo]]:
 
 def filmed(folder: Path, avatar: str, names: Sequence[Name], wanted: FilmConfig) -> dict[Name, MonocularVideo]:
     """Takes of an avatar of ours in these motions, each in a folder of its own below one, filmed where it is not there
-    yet."""
+    yet; those of other settings are deleted."""
+    keep_films(folder, wanted)
     folders = {name: folder / f"{name[0]}-{name[1]}" for name in names}
     missing = {name: place for name, place in folders.items() if not (place / capture.MESHES).is_file()}
     if missing:

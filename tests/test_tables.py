@@ -11,7 +11,7 @@ from avatarjax.metrics.published import UNICA_3
 from avatarjax.metrics.statistics import Estimate
 from experiments.tables import __main__ as tables
 from experiments.tables import deformers
-from experiments.tables.table import Notebook, Table, cell, ordering
+from experiments.tables.table import Notebook, Table, cell, mark, ordering
 
 
 def test_markdown_has_rows_remarks_and_pictures():
@@ -53,6 +53,14 @@ def test_a_notebook_measures_once_and_keeps_estimates(tmp_path):
     assert len(calls) == 1
     assert again["z"]["a"] == Estimate(1.0, 0.5, 2.0, 9, 3) == first["z"]["a"]
     assert math.isnan(again["x"].low) and again["y"] == [1, 2.5]
+
+
+def test_marks_tell_contents_apart(tmp_path):
+    marks = []
+    for name, content in (("a", b"weights"), ("b", b"weights"), ("c", b"others")):
+        (tmp_path / name).write_bytes(content)
+        marks.append(mark(tmp_path / name))
+    assert marks[0] == marks[1] != marks[2]
 
 
 def test_without_a_run_the_command_says_how_to_make_one(tmp_path, capsys, monkeypatch):

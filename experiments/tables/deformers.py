@@ -19,7 +19,7 @@ from avatarjax.gaussians import Gaussians
 from avatarjax.metrics import drift, lpips, pretrained
 from avatarjax.metrics.published import SMAD, SMAD_2, SMAD_4, SMAD_5
 from avatarjax.metrics.statistics import Estimate, bootstrap
-from avatarjax.smad import driving, dynamics, hull, train_dynamics, train_pictures
+from avatarjax.smad import driving, dynamics, files, hull, train_dynamics, train_pictures
 from avatarjax.smad.config import SmadConfig
 from avatarjax.smad.footage import Footage
 from avatarjax.smad.graph import GraphConfig
@@ -30,7 +30,7 @@ from experiments import smad_measures as measures
 from experiments import smad_motions
 from experiments.smad_dynamics import LEARNED, net
 from experiments.smad_dynamics_tables import EQUILIBRIUM, OURS, SKINNING
-from experiments.tables.table import Notebook, Table
+from experiments.tables.table import Notebook, Table, mark
 
 PARTS = ("train", "test", "unseen")
 CODES, STILL = "without latent codes", "B0 no velocities"
@@ -69,8 +69,8 @@ class Workshop:
 
     @property
     def name(self) -> str:
-        """Of the run."""
-        return f"{self.folder.parent.name}-{self.folder.name}"
+        """Of the run and of what it has learned."""
+        return f"{self.folder.parent.name}-{self.folder.name}-{mark(self.folder / files.FILE)}"
 
     @functools.cached_property
     def config(self) -> SmadConfig:

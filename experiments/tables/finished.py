@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import typing
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from avatarjax.metrics.statistics import Estimate, bootstrap
 from avatarjax.unica import batches, evaluate, files, image_quality
 from avatarjax.unica.avatar import wear as wear_surface
 from avatarjax.unica.config import DynamicsName
+from experiments.tables.table import mark
 from experiments.unica_rollout import SCRIPT
 
 NEXT_FRAMES = 50  # of the script, in four views
@@ -61,8 +61,7 @@ class Finished:
 
     def mark(self, dynamics: DynamicsName) -> str:
         """A short name of the trained weights, which tells measured cells of one training from those of another."""
-        content = (self.folder / files.file_name(dynamics)).read_bytes()
-        return f"{self.name}-{self.folder.name}-{dynamics}-{hashlib.sha256(content).hexdigest()[:8]}"
+        return f"{self.name}-{self.folder.name}-{dynamics}-{mark(self.folder / files.file_name(dynamics))}"
 
     def video(self, avatar: unica.Avatar, seed: int, script: tuple[int, ...] = SCRIPT) -> np.ndarray:
         """A rollout of a script of keys from standing, as `image_quality.video` sees it: (4, f, h, w, 3) uint8.

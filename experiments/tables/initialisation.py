@@ -24,6 +24,7 @@ from avatarjax.smad.radiance_field import FieldConfig
 from avatarjax.smad.refine import Refined
 from avatarjax.smad.template import TemplateConfig
 from avatarjax.splat import render
+from experiments import smad as experiment
 from experiments.clock import Clock
 from experiments.tables.table import BETTER, Notebook, Table
 
@@ -72,14 +73,19 @@ class Video:
         return smad.preset(self.preset)
 
     @functools.cached_property
+    def videos(self) -> list[MonocularVideo]:
+        """What it was filmed in, the slow turn first."""
+        return [load_monocular(folder) for folder in films(self.folder, self.config)]
+
+    @functools.cached_property
     def takes(self) -> Footage:
         """All that Gaussians are refined on and measured on."""
-        return footage.gather([load_monocular(folder) for folder in films(self.folder, self.config)])
+        return footage.gather(self.videos)
 
     @functools.cached_property
     def turn(self) -> MonocularVideo:
         """The slow turn, which Gaussians begin with, without the frames that they are measured on."""
-        whole = load_monocular(films(self.folder, self.config)[0])
+        whole = self.videos[0]
         return whole.only(np.flatnonzero(~self.takes.held_out[: len(whole)]))
 
     @functools.cached_property
@@ -160,7 +166,8 @@ def initialisation(folders: list[Path], notebook: Notebook, folder: Path) -> Tab
         video = Video(run, folder / "initialisation" / run.parent.name)
         found: dict[str, list[Measured]] = {}
         for method in METHODS:
-            names = [f"{video.name}-{video.preset}, {method}, seed {seed}" for seed in SEEDS]
+            mark = experiment.fingerprint(video.videos)
+            names = [f"{video.name}-{video.preset}-{mark}, {method}, seed {seed}" for seed in SEEDS]
             works = [functools.partial(_measured, video, method, seed) for seed in SEEDS]
             found[method] = [notebook.measured(*each) for each in zip(names, works, strict=True)]
             for state in STATES:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
 import typing
@@ -84,6 +85,11 @@ class Notebook:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             atomic.write_text(self.path, json.dumps(self._cells, indent=1))
         return _rich(self._cells[name])
+
+
+def mark(path: Path) -> str:
+    """A short name of what a file holds, which tells cells that were measured on it from those of another."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:8]
 
 
 _ESTIMATE = set(Estimate._fields)
