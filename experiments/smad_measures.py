@@ -137,17 +137,17 @@ def picture_values(
     values: dict[str, dict[str, list[float]]] = {name: {} for name in moved}
     for frame, view in itertools.product(measured_frames(views[0].frames), views):
         camera, truth, inside = view.at(frame)
-        mask = jnp.asarray(inside[..., None], jnp.float32)
-        for name, method in moved.items():
-            drawn = jnp.clip(draw(method.gaussians(frame), camera), 0, 1)
-            found = {
-                "PSNR": image.psnr(drawn, truth),
-                "PSNR in the mask": image.masked_psnr(drawn, truth, mask),
-                "SSIM": image.ssim(drawn, truth),
-            }
-            if perceptual is not None:
-                found["LPIPS"] = lpips.distance(perceptual, drawn, truth)
-            for what, value in found.items():
+        drawn = jnp.clip(jnp.stack([draw(method.gaussians(frame), camera) for method in moved.values()]), 0, 1)
+        pairs = drawn, jnp.broadcast_to(truth, drawn.shape)
+        found = {
+            "PSNR": image.psnr(*pairs),
+            "PSNR in the mask": image.masked_psnr(*pairs, jnp.asarray(inside[..., None], jnp.float32)),
+            "SSIM": image.ssim(*pairs),
+        }
+        if perceptual is not None:
+            found["LPIPS"] = lpips.distance(perceptual, drawn, truth)
+        for what, each in found.items():
+            for name, value in zip(moved, np.asarray(each), strict=True):
                 values[name].setdefault(what, []).append(float(value))
     return values
 

@@ -51,6 +51,14 @@ def test_it_is_a_symmetric_distance_of_any_batch_shape(networks, pictures):
     np.testing.assert_allclose(lpips.distance(net, a[0, 1], b[0, 1]), found[0, 1], rtol=1e-5)
 
 
+def test_all_may_be_compared_with_one(networks, pictures):
+    net, (a, b) = networks["alex"], pictures
+    each = [float(lpips.distance(net, x, b[0])) for x in a]
+    np.testing.assert_allclose(lpips.distance(net, a, b[0]), each, rtol=1e-5)
+    with pytest.raises(ValueError, match="different shapes"):
+        lpips.distance(net, a, b[0, 1:])
+
+
 def test_sides_need_not_be_equal_or_even(networks, pictures):
     crop = [x[0, :33, :45] for x in pictures]
     for net in networks.values():

@@ -63,10 +63,12 @@ def load(name: str = "alex") -> Network:
 def distance(network: Network, a: Images, b: Images) -> Float[Array, "..."]:
     """LPIPS of images (..., h, w, 3) in [0, 1]: 0 for equal images, about 0.7 for unrelated ones; differentiable.
 
-    A loss may use it under jit, where values are not checked. Raises ValueError for different shapes, other than three
-    channels, sides below 32 pixels, and outside jit for NaN and values outside [0, 1]. SMAD C.3; UNICA 4.2.
+    `b` may be one image (h, w, 3) that all others are compared with, whose features are then found once. A loss may use
+    it under jit, where values are not checked. Raises ValueError for different shapes, other than three channels, sides
+    below 32 pixels, and outside jit for NaN and values outside [0, 1]. SMAD C.3; UNICA 4.2.
     """
-    check_images(a, b)
+    for images in ((a,), (b,)) if b.shape == a.shape[-3:] else ((a, b),):
+        check_images(*images)
     if a.shape[-1] != 3 or min(a.shape[-3:-1]) < SMALLEST:
         raise ValueError(f"LPIPS compares images of three channels and {SMALLEST} pixels or more, got {a.shape}")
     return _distance(network, jnp.asarray(a), jnp.asarray(b))
@@ -74,21 +76,28 @@ def distance(network: Network, a: Images, b: Images) -> Float[Array, "..."]:
 
 @jax.jit
 def _distance(network: Network, a: Array, b: Array) -> Array:
-    # A few pairs at a time: the features take some hundred times the memory of their picture.
-    flat = tuple(x.reshape(-1, *x.shape[-3:]) for x in (a, b))
-    distances = jax.lax.map(lambda pair: _pair(network, jnp.stack(pair)), flat, batch_size=_PAIRS)
+    flat = a.reshape(-1, *a.shape[-3:])
+    # A few at a time: the features take some hundred times the memory of their picture.
+    if b.ndim == 3:
+        known = _features(network, b)
+        distances = jax.lax.map(lambda x: _apart(network, _features(network, x), known), flat, batch_size=_PAIRS)
+    else:
+        pairs = flat, b.reshape(flat.shape)
+        distances = jax.lax.map(
+            lambda pair: _apart(network, *(_features(network, x) for x in pair)), pairs, batch_size=_PAIRS
+        )
     return distances.reshape(a.shape[:-3])
 
 
-def _pair(network: Network, pair: Float[Array, "2 h w 3"]) -> Array:
+def _apart(network: Network, a: list[Array], b: list[Array]) -> Array:
     # The head weighs channels and does nothing else, so it may come after the mean over places.
-    features = zip(network.heads, _features(network, pair), strict=True)
-    return sum((jnp.mean((x[0] - x[1]) ** 2, axis=(0, 1)) @ head for head, x in features), jnp.zeros(()))
+    layers = zip(network.heads, a, b, strict=True)
+    return sum((jnp.mean((x - y) ** 2, axis=(0, 1)) @ head for head, x, y in layers), jnp.zeros(()))
 
 
-def _features(network: Network, images: Float[Array, "n h w 3"]) -> list[Array]:
-    """Features of five layers, each of unit length in every place."""
-    x = (images - _MEAN) / _STD
+def _features(network: Network, image: Float[Array, "h w 3"]) -> list[Array]:
+    """Features (h', w', c) of five layers, each of unit length in every place."""
+    x = (image[None] - _MEAN) / _STD
     taken, layers = [], zip(network.kernels, network.biases, strict=True)
     for layer in _ALEX if network.name == "alex" else _VGG:
         if isinstance(layer, str):
@@ -102,7 +111,7 @@ def _features(network: Network, images: Float[Array, "n h w 3"]) -> list[Array]:
         )
         x = jax.nn.relu(x + bias[None, None, None])
         if take:
-            taken.append(_unit(x))
+            taken.append(_unit(x[0]))
     return taken
 
 
