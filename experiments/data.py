@@ -242,14 +242,14 @@ def show(avatar: AvatarMesh, clips: _Clips, folder: Path) -> None:
 def film(
     avatar: AvatarMesh, args: Args, wanted: dataset.DatasetSpec, folder: Path
 ) -> dict[str, dict[str, float | None]]:
-    """Film every performance that was not filmed before, and measure all."""
+    """Film every performance that was not filmed in these settings before, and measure all."""
     motions = {name: jax.device_get(performances.perform(avatar.rig, name, args.seed)) for name in performances.NAMES}
-    missing = [name for name in motions if not (folder / name / capture.MESHES).is_file()]
-    frames = 2 * sum(len(motions[name].headings) for name in missing)
+    takes = [capture.Take(folder / name, lambda name=name: motions[name]) for name in motions]
+    settings = {"size": max(128, wanted.image_size), "config": XPBDConfig(substeps=wanted.cloth_steps)}
+    missing = capture.missing(takes, **settings)
+    frames = 2 * sum(len(take.motion().headings) for take in missing)
     with tqdm(total=frames, desc="filming", unit="frame", disable=not missing) as bar:
-        takes = [capture.Take(folder / name, lambda name=name: motions[name]) for name in missing]
-        config, size = XPBDConfig(substeps=wanted.cloth_steps), max(128, wanted.image_size)
-        capture.film(takes, avatar, size=size, config=config, progress=bar.update)
+        capture.film(missing, avatar, **settings, progress=bar.update)
     return {name: measured(avatar, name, motion, folder / name) for name, motion in motions.items()}
 
 

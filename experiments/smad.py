@@ -164,29 +164,17 @@ def film(experiment: Experiment) -> dict[str, list[MonocularVideo]]:
 
 def filmed(folder: Path, avatar: str, names: Sequence[Name], wanted: FilmConfig) -> dict[Name, MonocularVideo]:
     """Takes of an avatar of ours in these motions, each in a folder of its own below one, filmed where it is not there
-    yet; those of other settings are deleted."""
-    keep_films(folder, wanted)
-    folders = {name: folder / f"{name[0]}-{name[1]}" for name in names}
-    missing = {name: place for name, place in folders.items() if not (place / capture.MESHES).is_file()}
-    if missing:
-        mesh, config = avatars.build(avatar), XPBDConfig(substeps=wanted.substeps)
-        takes = [capture.Take(p, functools.partial(smad_motions.perform, mesh.rig, n)) for n, p in missing.items()]
-        # Each frame is simulated, then drawn.
-        frames = 2 * sum(smad_motions.length(name) for name in missing)
-        with tqdm(total=frames, desc="filming", unit="frame") as bar:
-            capture.film(takes, mesh, size=wanted.size, config=config, progress=bar.update)
-    return {name: load_monocular(place).held() for name, place in folders.items()}
-
-
-def keep_films(folder: Path, wanted: FilmConfig) -> None:
-    """Films of other settings are deleted, with a word; those of the same are kept."""
-    settings = json.dumps({"size": wanted.size, "substeps": wanted.substeps, "edges": "mattes"})
-    path = folder / "settings.json"
-    if folder.exists() and (not path.is_file() or path.read_text() != settings):
-        print(f"deleting films of other settings in {folder}")
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    atomic.write_text(path, settings)
+    yet, or in other settings."""
+    mesh = functools.cache(lambda: avatars.build(avatar))
+    takes = {n: capture.Take(folder / f"{n[0]}-{n[1]}", lambda n=n: smad_motions.perform(mesh().rig, n)) for n in names}
+    settings = {"size": wanted.size, "config": XPBDConfig(substeps=wanted.substeps)}
+    missing = capture.missing(list(takes.values()), **settings)
+    # Each frame is simulated, then drawn.
+    frames = 2 * sum(smad_motions.length(name) for name, take in takes.items() if take in missing)
+    with tqdm(total=frames, desc="filming", unit="frame", disable=not missing) as bar:
+        if missing:
+            capture.film(missing, mesh(), **settings, progress=bar.update)
+    return {name: load_monocular(take.folder).held() for name, take in takes.items()}
 
 
 def fingerprint(takes: Sequence[MonocularVideo]) -> str:

@@ -186,15 +186,6 @@ def test_a_second_run_reuses_and_a_stage_runs_anew(finished, capsys):
     assert "report:" not in capsys.readouterr().out
 
 
-def test_films_of_other_settings_are_not_kept(tmp_path, capsys):
-    folder = tmp_path / "film"
-    for size, kept in ((48, False), (48, True), (96, False)):
-        experiment.keep_films(folder, FilmConfig(size=size))
-        assert (folder / "arcs-0").is_file() == kept
-        assert ("deleting films" in capsys.readouterr().out) == (size == 96)
-        (folder / "arcs-0").write_text("a film")
-
-
 @pytest.mark.parametrize(
     "changes, message",
     [

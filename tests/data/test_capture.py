@@ -1,6 +1,7 @@
 """Cameras that follow a figure: from the front, and from elsewhere."""
 
 import threading
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,8 @@ import pytest
 from avatarjax import cameras
 from avatarjax.data import capture
 from avatarjax.data.mesh_renderer import MeshRenderer
+from avatarjax.io import weights
+from avatarjax.physics.xpbd import XPBDConfig
 
 PATH = np.stack([np.linspace(0, 3, 40), np.ones(40), np.linspace(0, -2, 40)], axis=1)
 
@@ -56,3 +59,13 @@ def test_the_next_take_is_made_while_one_is_used_and_a_failure_loses_none_before
     with pytest.raises(ValueError, match="third"):
         next(made)
     assert list(capture._ahead(work, [])) == []
+
+
+def test_films_of_other_settings_are_missing(tmp_path):
+    takes = [capture.Take(tmp_path / name, lambda: None) for name in ("filmed", "older", "never")]
+    known = capture._settings(48, XPBDConfig(substeps=4))
+    for take, metadata in zip(takes, ({"film": known}, {}), strict=False):
+        weights.save_tree(Path(take.folder) / capture.MESHES, {"vertices": np.zeros((1, 3, 3), np.float16)}, **metadata)
+    assert capture.missing(takes, size=48, config=XPBDConfig(substeps=4)) == takes[1:]
+    assert capture.missing(takes, size=96, config=XPBDConfig(substeps=4)) == takes
+    assert capture.missing(takes, size=48, config=XPBDConfig(substeps=8)) == takes

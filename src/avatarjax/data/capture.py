@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
 import shutil
 import typing
@@ -70,6 +72,16 @@ def poses_of(rig: Rig, motion: Motion) -> Poses:
     )
 
 
+def missing(takes: Sequence[Take], *, size: int = 512, config: XPBDConfig = XPBDConfig()) -> list[Take]:
+    """The takes whose folders hold no film of these settings."""
+
+    def there(take: Take) -> bool:
+        path = Path(take.folder) / MESHES
+        return path.is_file() and weights.load_arrays(path, names=())[1].get("film") == _settings(size, config)
+
+    return [take for take in takes if not there(take)]
+
+
 def film(
     takes: Sequence[Take],
     avatar: AvatarMesh,
@@ -91,7 +103,12 @@ def film(
         return motion, dressing.simulate(avatar, motion.transforms, config, progress=progress)
 
     for take, (motion, vertices) in zip(takes, _ahead(simulated, takes), strict=True):
-        _shoot(Path(take.folder), avatar, motion, vertices, size, progress)
+        _shoot(Path(take.folder), avatar, motion, vertices, size, _settings(size, config), progress)
+
+
+def _settings(size: int, config: XPBDConfig) -> str:
+    """What tells films of one take apart."""
+    return json.dumps({"size": size, "edges": "mattes", **dataclasses.asdict(config)})
 
 
 def _ahead(work: Callable[[Take], typing.Any], takes: Sequence[Take]) -> Iterator[typing.Any]:
@@ -112,6 +129,7 @@ def _shoot(
     motion: Motion,
     vertices: Float[np.ndarray, "f v 3"],
     size: int,
+    settings: str,
     progress: Callable[[int], object] | None,
 ) -> None:
     """Draw and write a take that has been simulated."""
@@ -127,7 +145,8 @@ def _shoot(
     images, mattes = zip(*shots, strict=True)
     write_monocular(new, list(images), list(mattes), camera, poses_of(avatar.rig, motion))
     relative = (vertices - np.asarray(motion.hips)[:, None]).astype(np.float16)
-    weights.save_tree(new / MESHES, {"vertices": relative, "faces": avatar.faces, "uvs": avatar.uvs})
+    tree = {"vertices": relative, "faces": avatar.faces, "uvs": avatar.uvs}
+    weights.save_tree(new / MESHES, tree, film=settings)
     shutil.rmtree(folder, ignore_errors=True)
     new.rename(folder)
 
