@@ -141,7 +141,7 @@ def picture_values(
         pairs = drawn, jnp.broadcast_to(truth, drawn.shape)
         found = {
             "PSNR": image.psnr(*pairs),
-            "PSNR in the mask": image.masked_psnr(*pairs, jnp.asarray(inside[..., None], jnp.float32)),
+            "PSNR in the mask": image.masked_psnr(*pairs, jnp.asarray(inside[None, ..., None], jnp.float32)),
             "SSIM": image.ssim(*pairs),
         }
         if perceptual is not None:
@@ -159,9 +159,10 @@ def over_black(picture: UInt8[np.ndarray, "h w 3"], coverage: UInt8[np.ndarray, 
 
 def draw(gaussians: Gaussians, camera: Camera) -> jax.Array:
     """A cloud over black (h, w, 3)."""
-    # Rounded to a power of two, so that the frames of a take share a compiled program.
-    capacity = 2 ** int(np.ceil(np.log2(required_capacity(gaussians, camera))))
-    return _draw(gaussians, camera, SplatConfig(capacity=capacity, depth=False))
+    out = _draw(gaussians, camera, SplatConfig(depth=False))
+    if out.info.dropped:
+        out = _draw(gaussians, camera, SplatConfig(capacity=required_capacity(gaussians, camera), depth=False))
+    return out.image
 
 
 def true_nodes(avatar: smad.Avatar, canonical: MonocularVideo, take: MonocularVideo) -> np.ndarray | None:
@@ -223,4 +224,4 @@ def _dressed(avatar, nodes, poses, frame):
 
 @functools.partial(jax.jit, static_argnames="config")
 def _draw(gaussians, camera, config):
-    return render(gaussians, camera, config=config).image
+    return render(gaussians, camera, config=config)

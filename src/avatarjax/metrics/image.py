@@ -49,9 +49,14 @@ def check_images(*images: Images) -> None:
     for x in images:
         if isinstance(x, jax.core.Tracer) or not x.size:
             continue
-        low, high = float(x.min()), float(x.max())
+        low, high = (x.min(), x.max()) if isinstance(x, np.ndarray) else np.asarray(_range(x))
         if not 0 <= low <= high <= 1:
             raise ValueError(f"images must be finite and within [0, 1], got values from {low} to {high}")
+
+
+@jax.jit
+def _range(x: Array) -> Float[Array, "2"]:
+    return jnp.stack([jnp.min(x), jnp.max(x)])
 
 
 @jax.jit

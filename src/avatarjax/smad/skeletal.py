@@ -48,7 +48,7 @@ def bones(rig: Rig, pose: Pose) -> Float[Array, "j 3 4"]:
     """What carries points of the rest pose, bone by bone, to the body frame of a pose."""
     tilt = rotations.yaw_matrix(driving.yaw(pose.root_rotation)).T @ pose.root_rotation
     turns = pose.rotations.at[0].set(tilt @ pose.rotations[0])
-    return skinning.forward_kinematics(rig, rotations.from_matrix(turns), jnp.zeros(3))
+    return skinning.pose_bones(rig, turns, jnp.zeros(3))
 
 
 @functools.partial(jax.jit, static_argnames="sharpness")
