@@ -181,7 +181,7 @@ def fingerprint(takes: Sequence[MonocularVideo]) -> str:
     """What tells these takes from others."""
     mark = hashlib.sha256()
     for take in takes:
-        mark.update(np.ascontiguousarray(take.masks if take.mattes is None else take.mattes))
+        mark.update(np.ascontiguousarray(take.mattes))
         mark.update(np.ascontiguousarray(take.poses.rotations))
         mark.update(np.ascontiguousarray(take.images()[::10]))
     return mark.hexdigest()[:12]

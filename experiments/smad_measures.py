@@ -83,7 +83,7 @@ def recorded_view(take: MonocularVideo) -> View:
     """What the camera that filmed saw."""
 
     def at(frame):
-        return take.camera_at(frame), over_black(take.images()[frame], take.coverage(frame)), take.masks[frame]
+        return take.camera_at(frame), over_black(take.images()[frame], take.mattes[frame]), take.masks[frame]
 
     return View(len(take), at)
 
@@ -152,9 +152,9 @@ def picture_values(
     return values
 
 
-def over_black(picture: UInt8[np.ndarray, "h w 3"], coverage: UInt8[np.ndarray, "h w"]) -> jax.Array:
+def over_black(picture: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"]) -> jax.Array:
     """A picture (h, w, 3) in 0..1 with what is not the person black."""
-    return jnp.asarray(picture / 255 * (coverage[..., None] / 255), jnp.float32)
+    return jnp.asarray(picture / 255 * (matte[..., None] / 255), jnp.float32)
 
 
 def draw(gaussians: Gaussians, camera: Camera) -> jax.Array:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from avatarjax import cameras, rotations, splat
-from avatarjax.data.recording import MonocularVideo, Poses
+from avatarjax.data.recording import MonocularVideo, Poses, solid
 from avatarjax.gaussians import Gaussians
 from avatarjax.smad import driving, skeletal
 from avatarjax.smad.driving import Pose
@@ -78,5 +78,5 @@ def take(frames=30, size=48, bend=0.0, skeleton=True, period=15.0, cloud=None):
         images.append(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8))
         masks.append(np.asarray(alpha) > 0.5)
     shown = poses(frames, bend, skeleton)
-    video = MonocularVideo(Path("."), np.stack(masks), camera, shown, 30.0, lambda: iter(images))
+    video = MonocularVideo(Path("."), solid(np.stack(masks)), camera, shown, 30.0, lambda: iter(images))
     return video, np.stack(tracks)

@@ -210,7 +210,7 @@ def test_a_run_goes_on_and_another_seed_is_another_run(trained, film):
     again = training.train(film, CONFIG, folder)
     jax.tree.map(np.testing.assert_array_equal, again.params, result.params)
     with pytest.raises(ValueError, match="masks are empty"):
-        training.train(dataclasses.replace(film, masks=np.zeros_like(film.masks)), CONFIG, folder)
+        training.train(dataclasses.replace(film, mattes=np.zeros_like(film.mattes)), CONFIG, folder)
 
 
 def test_gradients_are_finite_and_reach_every_parameter(trained, film):

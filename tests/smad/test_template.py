@@ -39,7 +39,9 @@ def person():
     )
     pictures = np.broadcast_to(np.where(low, BLUE, RED), (FRAMES, 64, 64, 3)).astype(np.uint8)
     poses = capture.poses_of(rig, motion)
-    video = MonocularVideo(Path("."), np.ones((FRAMES, 64, 64), bool), camera, poses, 30.0, lambda: iter(pictures))
+    video = MonocularVideo(
+        Path("."), np.full((FRAMES, 64, 64), 255, np.uint8), camera, poses, 30.0, lambda: iter(pictures)
+    )
     return video, moved
 
 

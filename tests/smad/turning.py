@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from avatarjax import cameras
-from avatarjax.data.recording import MonocularVideo, Poses
+from avatarjax.data.recording import MonocularVideo, Poses, solid
 
 CENTRE = np.array([0.3, 1.0, -0.2])  # Of the body's frame, in the world.
 RED, BLUE = np.array([220, 40, 30]), np.array([20, 60, 210])
@@ -55,7 +55,7 @@ def video(shape=ellipsoid, frames=24, size=64, sway=0.0, empty=False):
         np.tile(np.eye(3, dtype=np.float32), (frames, 1, 1, 1)), np.float32(turns), np.float32(places), ("root",), (-1,)
     )
     return MonocularVideo(
-        Path("."), np.stack(masks), camera, poses, 30.0, lambda: iter(images), _loaded=np.stack(images)
+        Path("."), solid(np.stack(masks)), camera, poses, 30.0, lambda: iter(images), _loaded=np.stack(images)
     )
 
 
@@ -66,4 +66,4 @@ def moving_camera(film):
     camera = film.camera.replace(
         world_to_camera=tile(film.camera.world_to_camera), intrinsics=tile(film.camera.intrinsics)
     )
-    return MonocularVideo(film.folder, film.masks, camera, film.poses, film.fps, film.decode, _loaded=film.images())
+    return MonocularVideo(film.folder, film.mattes, camera, film.poses, film.fps, film.decode, _loaded=film.images())

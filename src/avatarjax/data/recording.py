@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import typing
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -35,27 +36,30 @@ class Poses:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MonocularVideo:
-    """f frames of one person: masks (f, h, w), a camera (one, or a batch of f), poses, and RGB frames.
+    """f frames of one person: mattes (f, h, w), a camera (one, or a batch of f), poses, and RGB frames.
 
-    mattes (f, h, w) uint8 say how much of each pixel the person covers, where that is known; the frames then show the
-    person's own colour wherever there is any of it. Without them a pixel at an edge is the person's or not, and mixed
-    with what is behind.
+    Mattes say how much of each pixel the person covers, 0 to 255, where the frames show the person's own colour. Where
+    no more than masks is known they are all or nothing (`solid`), and a pixel at an edge is mixed with what is behind.
 
     Iterate over `frames()` to decode one (h, w, 3) uint8 image at a time; `images()` holds all of them. `decode()`
     begins to read them from their files.
     """
 
     folder: Path
-    masks: np.ndarray
+    mattes: UInt8[np.ndarray, "f h w"]
     camera: Camera
     poses: Poses
     fps: float
     decode: Callable[[], Iterator[np.ndarray]]
-    mattes: np.ndarray | None = None
     _loaded: np.ndarray | None = None
 
     def __len__(self) -> int:
-        return len(self.masks)
+        return len(self.mattes)
+
+    @functools.cached_property
+    def masks(self) -> Bool[np.ndarray, "f h w"]:
+        """Pixels of which the person covers half or more."""
+        return self.mattes > 127
 
     def frames(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         """The RGB frames in order, decoded as they are asked for."""
@@ -64,10 +68,6 @@ class MonocularVideo:
     def images(self) -> UInt8[np.ndarray, "f h w 3"]:
         """All RGB frames at once."""
         return self._loaded if self._loaded is not None else np.stack(list(self.frames()))
-
-    def coverage(self, frame: int) -> UInt8[np.ndarray, "h w"]:
-        """How much of each pixel of a frame the person covers, 0 to 255: all or nothing without mattes."""
-        return self.mattes[frame] if self.mattes is not None else np.where(self.masks[frame], 255, 0).astype(np.uint8)
 
     def camera_at(self, frame: int) -> Camera:
         """The camera of one frame."""
@@ -85,13 +85,17 @@ class MonocularVideo:
                 world_to_camera=camera.world_to_camera[frames], intrinsics=camera.intrinsics[frames]
             )
         parts = {name: getattr(poses, name)[frames] for name in ("rotations", "root_rotation", "root_translation")}
-        chosen = {"masks": self.masks[frames], "camera": camera, "poses": dataclasses.replace(poses, **parts)}
-        chosen["mattes"] = None if self.mattes is None else self.mattes[frames]
+        chosen = {"mattes": self.mattes[frames], "camera": camera, "poses": dataclasses.replace(poses, **parts)}
         return dataclasses.replace(self, **chosen, _loaded=self.images()[frames])
 
     def held(self) -> MonocularVideo:
         """The same video with all of its frames in memory."""
         return dataclasses.replace(self, _loaded=self.images())
+
+
+def solid(masks: Bool[np.ndarray, "*f h w"]) -> UInt8[np.ndarray, "*f h w"]:
+    """Mattes that are all or nothing."""
+    return np.where(masks, np.uint8(255), np.uint8(0))
 
 
 def check_poses(poses: Poses, path: Path) -> None:

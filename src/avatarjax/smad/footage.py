@@ -121,7 +121,7 @@ def _decode(take: int, video: MonocularVideo, shrink: int) -> UInt8[np.ndarray, 
     count = 0
     for count, frame in enumerate(video.frames(), start=1):
         if count <= len(video):
-            alpha = video.coverage(count - 1)[..., None]
+            alpha = video.mattes[count - 1, ..., None]
             premultiplied = np.round(frame * (alpha / np.float32(255))).astype(np.uint8)
             pictures[count - 1] = _shrunk(np.concatenate([premultiplied, alpha], axis=-1), shrink)
     if count != len(video):

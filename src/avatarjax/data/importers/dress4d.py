@@ -22,7 +22,7 @@ import numpy as np
 
 from avatarjax.cameras import Camera
 from avatarjax.data.importers import series, smpl
-from avatarjax.data.recording import MonocularVideo, not_rotations, read_nonzero, read_rgb
+from avatarjax.data.recording import MonocularVideo, not_rotations, read_nonzero, read_rgb, solid
 from avatarjax.io import exr
 
 CAPTURE, CAMERAS, SMPL = "Capture", "cameras.pkl", "SMPL"
@@ -62,7 +62,7 @@ def load(folder: Path, camera: str | None) -> MonocularVideo:
     view = _camera(calibration[camera], *exr.read_png(images[0]).shape[1::-1], f"{path}, camera {camera}")
     return MonocularVideo(
         folder,
-        np.stack([read_nonzero(mask, view) for mask in masks]),
+        solid(np.stack([read_nonzero(mask, view) for mask in masks])),
         view,
         smpl.read_poses(parameters, np.eye(3)),
         FPS,

@@ -26,7 +26,7 @@ from jaxtyping import Bool, UInt8
 
 from avatarjax.cameras import Camera
 from avatarjax.data.importers import dress4d, series, zju_mocap
-from avatarjax.data.recording import MonocularVideo, Poses, check_poses, not_rotations
+from avatarjax.data.recording import MonocularVideo, Poses, check_poses, not_rotations, solid
 from avatarjax.io import atomic, exr, video
 
 VIDEO, IMAGES, MASKS, CAMERAS, POSES = "video.mp4", "images", "masks", "cameras.json", "poses.npz"
@@ -59,16 +59,14 @@ def _load(folder: Path) -> MonocularVideo:
     camera = _read_cameras(folder / CAMERAS)
     poses = _read_poses(folder / POSES)
     mattes = np.stack([_read_matte(path, camera) for path in _pictures(folder / MASKS)])
-    masks = mattes > 127
     count, fps = _count(folder)
-    lengths = {"masks": len(masks), "poses": len(poses)}
+    lengths = {"masks": len(mattes), "poses": len(poses)}
     if camera.world_to_camera.ndim == 3:
         lengths["cameras"] = len(camera.world_to_camera)
     for what, length in lengths.items():
         if length != count:
             raise ValueError(f"{folder} has {count} frames and {length} {what}: give one for each frame")
-    soft = mattes if ((mattes > 0) & (mattes < 255)).any() else None
-    return MonocularVideo(folder, masks, camera, poses, fps, functools.partial(_decode, folder, camera), mattes=soft)
+    return MonocularVideo(folder, mattes, camera, poses, fps, functools.partial(_decode, folder, camera))
 
 
 def write_monocular(
@@ -101,7 +99,7 @@ def write_monocular(
             for k, frame in enumerate(frames):
                 exr.write_png(temporary / IMAGES / f"{k:05d}.png", frame)
         for k, mask in enumerate(masks):
-            matte = mask if mask.dtype == np.uint8 else 255 * mask.astype(np.uint8)
+            matte = mask if mask.dtype == np.uint8 else solid(mask)
             exr.write_png(temporary / MASKS / f"{k:05d}.png", matte[..., None])
         _write_cameras(temporary / CAMERAS, camera, fps)
         arrays: dict[str, np.ndarray] = {

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from avatarjax.cameras import Camera
 from avatarjax.data.importers import axes, series, smpl
 from avatarjax.data.importers.distortion import Undistortion
-from avatarjax.data.recording import MonocularVideo, not_rotations, read_nonzero, read_rgb
+from avatarjax.data.recording import MonocularVideo, not_rotations, read_nonzero, read_rgb, solid
 from avatarjax.io import exr
 
 ANNOTATIONS = "annots.npy"
@@ -71,7 +71,7 @@ def load(folder: Path, camera: str | None) -> MonocularVideo:
     view, lens = _camera(calibration, column, width, height, path)
     return MonocularVideo(
         folder,
-        np.stack([_read_mask(mask, view, lens) for mask in mask_paths]),
+        solid(np.stack([_read_mask(mask, view, lens) for mask in mask_paths])),
         view,
         smpl.read_poses(pose_paths, _WORLD),
         FPS,
