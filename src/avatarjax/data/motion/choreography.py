@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import typing
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -159,11 +158,6 @@ def arm_quats(rig: Rig, name: str, side: str) -> Float[np.ndarray, "2 4"]:
     return np.stack([first, _arc(rest[1], inside)])
 
 
-@jax.jit
-def _lock(rig: Rig, quats: Array, hips: Array, plan: foot_plans.Plan) -> tuple[Array, Array, Array]:
-    return footsteps.lock_feet(rig, quats, hips, plan)
-
-
 def play(rig: Rig, score: Score) -> Motion:
     """The motion (f frames) that a score describes; the body breathes as in the idle clip.
 
@@ -213,10 +207,10 @@ def play(rig: Rig, score: Score) -> Motion:
         toes=jnp.asarray(toes),
         contacts=jnp.asarray(contacts),
         until=jnp.asarray(foot_plans.frames_until(contacts, looping=False)),
-        tolerance=jnp.full(f, jnp.inf),
-        pivot_lag=jnp.zeros(f),
+        tolerance=jnp.full(f, jnp.inf, jnp.float32),
+        pivot_lag=jnp.zeros(f, jnp.float32),
     )
-    quats, hips, transforms = _lock(rig, quats, jnp.asarray(hips, jnp.float32), plan)
+    quats, hips, transforms = footsteps.lock_feet(rig, quats, jnp.asarray(hips, jnp.float32), plan)
     roots = np.stack([body[:, 0], np.zeros(f), body[:, 1]], 1)
     velocity = np.gradient(roots[:, [0, 2]], axis=0) * FPS
     along = np.stack([np.sin(body[:, 2]), np.cos(body[:, 2])], 1)

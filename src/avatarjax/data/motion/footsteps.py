@@ -291,6 +291,7 @@ def _place(rig: Rig, quats: Array, hips: Array, balls: Array, turns: Array, toes
     return footlock.place_feet(rig, quats, hips, balls, turns, toes)
 
 
+@jax.jit
 def lock_feet(
     rig: Rig, local_quats: Float[Array, "f j 4"], hips: Float[Array, "f 3"], plan: Plan
 ) -> tuple[Float[Array, "f j 4"], Float[Array, "f 3"], Float[Array, "f j 3 4"]]:

@@ -261,7 +261,6 @@ def _place(pose: tuple[Array, Array], state: _State, config: LocomotionConfig, l
     return quats, hips
 
 
-@functools.partial(jax.jit, static_argnames="config")
 def simulate(
     rig: Rig,
     clips: Clips,
@@ -275,23 +274,30 @@ def simulate(
     Starts at the origin of the ground. `key` draws the phases of the gait; `heading` (yaw, radians) is where a figure
     looks whose first action is idle. `jax.vmap` over actions, keys and headings makes batches.
     """
+    motion, plan = _simulated(rig, clips, actions, key, config, heading)
+    return motion if plan is None else _locked(rig, motion, plan)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _simulated(
+    rig: Rig, clips: Clips, actions: Array, key: Array, config: LocomotionConfig, heading: Array | float
+) -> tuple[Motion, foot_plans.Plan | None]:
+    """The motion before its feet are locked, and the plan for them; without `foot_lock` it stands on the ground."""
     look = _look(rig)
     state = initial_state(clips, actions[0], key, config, heading)
     step = functools.partial(_step, clips, config, look)
     _, ((quats, hips), states) = jax.lax.scan(step, state, actions)
+    plan = transforms = None
     if config.foot_lock:
         plan = _plan(rig, clips, config, states)
-        quats, hips, transforms = footsteps.lock_feet(rig, quats, hips, plan)
     else:
         transforms = jax.vmap(skinning.forward_kinematics, in_axes=(None, 0, 0))(rig, quats, hips)
         lift = _ground(rig, transforms, states.speed / clips.run_speed)
         transforms = transforms.at[..., 1, 3].add(lift[:, None])
         hips = hips.at[:, 1].add(lift)
-    roots = jnp.stack([states.position[:, 0], jnp.zeros(len(actions)), states.position[:, 1]], axis=1)
-    return Motion(quats, hips, transforms, roots, states.heading, states.speed)
+    return Motion(quats, hips, transforms, _on_ground(states.position), states.heading, states.speed), plan
 
 
-@functools.partial(jax.jit, static_argnames="config")
 def follow(
     rig: Rig,
     clips: Clips,
@@ -304,6 +310,13 @@ def follow(
 
     Starts at the origin, at `phase` (cycles) of the run's clip; the steps are as long as the speed makes them.
     """
+    return _locked(rig, *_followed(rig, clips, headings, speeds, phase, config))
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _followed(
+    rig: Rig, clips: Clips, headings: Array, speeds: Array, phase: Array | float, config: LocomotionConfig
+) -> tuple[Motion, foot_plans.Plan]:
     dt = 1 / config.fps
     frames = headings.shape[0]
     rates, pushes = (jnp.asarray(jnp.gradient(x)) / dt for x in (headings, speeds))
@@ -330,9 +343,18 @@ def follow(
     )
     look = _look(rig)
     quats, hips = jax.vmap(lambda s: _place(sample(clips.run, s.phases[1]), s, config, look))(states)
-    quats, hips, transforms = footsteps.lock_feet(rig, quats, hips, _plan(rig, clips, config, states))
-    roots = jnp.stack([states.position[:, 0], still, states.position[:, 1]], axis=1)
-    return Motion(quats, hips, transforms, roots, headings, speeds)
+    motion = Motion(quats, hips, None, _on_ground(states.position), headings, speeds)
+    return motion, _plan(rig, clips, config, states)
+
+
+def _locked(rig: Rig, motion: Motion, plan: foot_plans.Plan) -> Motion:
+    """The motion with its feet on the plan; a program of its own, which all motions of one length share."""
+    quats, hips, transforms = footsteps.lock_feet(rig, motion.local_quats, motion.hips, plan)
+    return motion.replace(local_quats=quats, hips=hips, transforms=transforms)
+
+
+def _on_ground(places: Float[Array, "f 2"]) -> Float[Array, "f 3"]:
+    return jnp.insert(places, 1, 0.0, axis=1)
 
 
 def _look(rig: Rig) -> np.ndarray:
@@ -378,7 +400,8 @@ def _plan(rig: Rig, clips: Clips, config: LocomotionConfig, states: _State) -> f
         choices.append((states.mode > 1, played, played_before))
         tolerance = jnp.where(states.mode > 1, config.emote_tolerance, tolerance)
     pivot_lag = jnp.where(running, config.pivot_lag, jnp.pi)
-    return foot_plans.plan(choices, tolerance, pivot_lag)
+    # Of no weak type, so that all plans share the program that locks feet.
+    return foot_plans.plan(choices, *(x.astype(jnp.float32) for x in (tolerance, pivot_lag)))
 
 
 def _forward(heading: Array) -> Array:
