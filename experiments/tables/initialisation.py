@@ -164,9 +164,9 @@ def initialisation(folders: list[Path], notebook: Notebook, folder: Path) -> Tab
     remarks, shown = [], []
     for run in folders:
         video = Video(run, folder / "initialisation" / run.parent.name)
+        mark = experiment.fingerprint(video.videos)
         found: dict[str, list[Measured]] = {}
         for method in METHODS:
-            mark = experiment.fingerprint(video.videos)
             names = [f"{video.name}-{video.preset}-{mark}, {method}, seed {seed}" for seed in SEEDS]
             works = [functools.partial(_measured, video, method, seed) for seed in SEEDS]
             found[method] = [notebook.measured(*each) for each in zip(names, works, strict=True)]
