@@ -67,8 +67,11 @@ def distance(network: Network, a: Images, b: Images) -> Float[Array, "..."]:
     it under jit, where values are not checked. Raises ValueError for different shapes, other than three channels, sides
     below 32 pixels, and outside jit for NaN and values outside [0, 1]. SMAD C.3; UNICA 4.2.
     """
-    for images in ((a,), (b,)) if b.shape == a.shape[-3:] else ((a, b),):
-        check_images(*images)
+    if b.shape == a.shape[-3:]:
+        check_images(a)
+        check_images(b)
+    else:
+        check_images(a, b)
     if a.shape[-1] != 3 or min(a.shape[-3:-1]) < SMALLEST:
         raise ValueError(f"LPIPS compares images of three channels and {SMALLEST} pixels or more, got {a.shape}")
     return _distance(network, jnp.asarray(a), jnp.asarray(b))
