@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, Int
 # Three arrays of coordinates: XLA's CPU backend is several times slower over a last axis of three.
 Columns = tuple[Array, Array, Array]
 
-# How many points are compared with all vertices at a time: their distances stay in the cache.
-_BLOCK = 16
+# So many queries are compared with so many points at a time.
+_QUERIES, _POINTS = 128, 32
 # Metres: a plane holds only so far around its point, and a vertex deeper than this is on the other side of a limb.
 _PLANE_RADIUS, _DEEPEST = 0.05, 0.10
 # The same for a sheet under a sheet, which is thin: deeper, a vertex is on its other side, and aside, beyond its edge.
@@ -54,36 +54,53 @@ def nearest(
     """The index (n,) of the nearest of points (m, 3) for each query (n, 3).
 
     With `rest_queries` and `rest_points`, only points that are more than `apart` metres away in that other pose count
-    (0 where there are none). All pairs are compared: distances carry the index in their lowest bits, so that the
-    minimum of integers finds both; squared distances are right to one part in 2^(23 - log2 m).
+    (0 where there are none). Each block of queries looks at blocks of points in the order of the gaps between their
+    bounding boxes, until none can hold a nearer point: quick where queries that follow each other are near each other,
+    as in a mesh, and points too. Distances carry the index in their lowest bits, so that the minimum of integers finds
+    both; squared distances are right to one part in 2^(23 - log2 m).
     """
     count = points.shape[0]
-    blocks = -(-count // _BLOCK)
-    bits = max(1, (blocks * _BLOCK - 1).bit_length())
+    bits = max(1, (-(-count // _POINTS) * _POINTS - 1).bit_length())
     mask = (1 << bits) - 1
-    far = jnp.pad(points, ((0, blocks * _BLOCK - count), (0, 0)), constant_values=1e6).reshape(blocks, _BLOCK, 3)
+    none = jnp.int32(jnp.iinfo(jnp.int32).max & ~mask)
+    # With a rest pose vectors have six coordinates: in the pose, and in the other one.
     known = rest_queries is not None and rest_points is not None
-    other = jnp.pad(rest_points, ((0, blocks * _BLOCK - count), (0, 0))).reshape(blocks, _BLOCK, 3) if known else far
+    asked = _blocks(columns(queries) + (columns(rest_queries) if known else ()), _QUERIES)
+    held = _blocks(columns(points) + (columns(rest_points) if known else ()), _POINTS)
+    low, high = (tuple(f(c, axis=1) for c in held[:3]) for f in (jnp.min, jnp.max))
 
-    def squares(a: Array, b: Array) -> Array:
-        offset = minus(columns(a[None]), columns(b[:, None]))
-        return dot(offset, offset)
+    def packed(squares: Array) -> Array:
+        return jax.lax.bitcast_convert_type(squares, jnp.int32) & ~mask
 
-    def block(best: Array, inputs: tuple[Array, Array, Array]) -> tuple[Array, None]:
-        own, rest, start = inputs
-        distance = jax.lax.bitcast_convert_type(squares(queries, own), jnp.int32)
-        packed = (distance & ~mask) | (start + jnp.arange(_BLOCK, dtype=jnp.int32))[:, None]
-        if known:
-            packed = jnp.where(squares(rest_queries, rest) > apart**2, packed, jnp.iinfo(jnp.int32).max & ~mask)
-        return jnp.minimum(best, packed.min(axis=0)), None
+    def search(own: tuple[Array, ...]) -> Array:
+        sides = zip(low, high, own[:3], strict=True)
+        gaps = tuple(jnp.maximum(jnp.maximum(a - c.max(), c.min() - b), 0) for a, b, c in sides)
 
-    start = jnp.arange(blocks, dtype=jnp.int32) * _BLOCK
-    best, _ = jax.lax.scan(
-        block, jnp.full(queries.shape[0], jnp.iinfo(jnp.int32).max & ~mask, jnp.int32), (far, other, start)
-    )
-    # Where only the block's padding was far enough in the other pose, no point counts.
-    found = best & mask
-    return jnp.where(found < count, found, 0)
+        def open_(carry: tuple[Array, Array]) -> Array:
+            left, best = carry
+            return left.min() <= best.max()
+
+        def look(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            left, best = carry
+            k = jnp.argmin(left)
+            offset = tuple(q[None] - p[k][:, None] for q, p in zip(own, held, strict=True))
+            found = packed(dot(offset[:3], offset[:3])) | (k * _POINTS + jnp.arange(_POINTS, dtype=jnp.int32))[:, None]
+            if known:
+                found = jnp.where(dot(offset[3:], offset[3:]) > apart**2, found, none)
+            return left.at[k].set(jnp.iinfo(jnp.int32).max), jnp.minimum(best, found.min(axis=0))
+
+        return jax.lax.while_loop(open_, look, (packed(dot(gaps, gaps)), jnp.full(_QUERIES, none)))[1]
+
+    # One block after the other has no use for what another still looks at; an accelerator is idle meanwhile.
+    best = jax.lax.platform_dependent(asked, cpu=lambda x: jax.lax.map(search, x), default=jax.vmap(search))
+    return best.reshape(-1)[: queries.shape[0]] & mask
+
+
+def _blocks(vectors: tuple[Array, ...], size: int) -> tuple[Array, ...]:
+    """Coordinates (n,) in blocks (b, size), as constants; the last vector fills the last block up."""
+    count = -(-vectors[0].shape[0] // size)
+    padding = 0, count * size - vectors[0].shape[0]
+    return tuple(jax.lax.stop_gradient(jnp.pad(c, padding, mode="edge").reshape(count, size)) for c in vectors)
 
 
 def find_planes(positions: Float[Array, "n 3"], surface: Surface) -> Int[Array, "g n"]:
