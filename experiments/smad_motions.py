@@ -92,7 +92,7 @@ class Stage:
             transforms = np.array(motion.transforms)
             if twin:
                 transforms[..., 3] += JITTER * np.random.default_rng(name[1]).normal(size=(len(transforms), 1, 3))
-            with tqdm(total=len(transforms) - 1, desc=path.stem, unit="frame") as bar:
+            with tqdm(total=len(transforms), desc=path.stem, unit="frame") as bar:
                 vertices = dressing.simulate(self.avatar, transforms, self.config, progress=bar.update)
             kept = driving.to_body(poses, jnp.asarray(vertices[:, self.canonical[2]]))
             path.parent.mkdir(parents=True, exist_ok=True)

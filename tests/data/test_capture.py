@@ -41,24 +41,22 @@ def test_a_photograph_has_the_colour_of_the_mesh_alone_wherever_there_is_any():
     assert (picture[matte == 0] == picture[0, 0]).all() and (picture[0, 0] != inside[0]).all()
 
 
-def test_the_next_take_is_made_while_one_is_used_and_a_failure_loses_none_before_it():
-    takes = [capture.Take(f"take-{k}", lambda: None) for k in range(3)]
+def test_the_next_is_made_while_one_is_used_and_a_failure_loses_none_before_it():
     begun = threading.Event()
 
-    def work(take):
-        if take is takes[1]:
-            begun.set()
-        if take is takes[2]:
-            raise ValueError("the third cannot be made")
-        return take.folder
+    def items():
+        yield "first"
+        begun.set()
+        yield "second"
+        raise ValueError("the third cannot be made")
 
-    made = capture._ahead(work, takes)
-    assert next(made) == "take-0"
+    made = capture._ahead(items())
+    assert next(made) == "first"
     assert begun.wait(10), "nobody asked for the second yet"
-    assert next(made) == "take-1"
+    assert next(made) == "second"
     with pytest.raises(ValueError, match="third"):
         next(made)
-    assert list(capture._ahead(work, [])) == []
+    assert list(capture._ahead(iter([]))) == []
 
 
 def test_films_of_other_settings_are_missing(tmp_path):

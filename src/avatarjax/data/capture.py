@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
+import itertools
 import json
 import os
 import shutil
@@ -32,6 +34,8 @@ MESHES = "meshes.safetensors"
 # Frames over which the operator smooths the path that the camera follows.
 _STEADINESS = 10.0
 _WALL = 237  # its brightness
+# So many chunks of frames may be simulated and not yet drawn.
+_AHEAD = 16
 
 
 class Take(typing.NamedTuple):
@@ -93,17 +97,23 @@ def film(
     """Simulate motions, film them and write a monocular folder of each.
 
     Beside what `load_monocular` reads, `meshes.safetensors` holds the true vertices relative to the root translation
-    as float16, faces and uvs. An older folder is replaced when its take is done. While one take is drawn the next is
-    simulated, as neither keeps two cores busy. `progress` is called with numbers of frames that were simulated or
-    drawn.
+    as float16, faces and uvs. An older folder is replaced when its take is done. While frames are drawn the next are
+    simulated, and the motions of later takes made, as no one of these keeps two cores busy. `progress` is called with
+    numbers of frames that were simulated or drawn.
     """
+    count = progress or (lambda _: None)
+    with ThreadPoolExecutor(1) as moving:
+        motions = [moving.submit(take.motion) for take in takes]
 
-    def simulated(take: Take) -> tuple[Motion, Float[np.ndarray, "f v 3"]]:
-        motion = take.motion()
-        return motion, dressing.simulate(avatar, motion.transforms, config, progress=progress)
+        def simulated() -> Iterator[tuple[int, Float[np.ndarray, "c v 3"]]]:
+            for k, motion in enumerate(motions):
+                for chunk in dressing.chunks(avatar, motion.result().transforms, config):
+                    count(len(chunk))
+                    yield k, chunk
 
-    for take, (motion, vertices) in zip(takes, _ahead(simulated, takes), strict=True):
-        _shoot(Path(take.folder), avatar, motion, vertices, size, _settings(size, config), progress)
+        for k, chunks in itertools.groupby(_ahead(simulated()), lambda made: made[0]):
+            frames = (frame for _, chunk in chunks for frame in chunk)
+            _shoot(Path(takes[k].folder), avatar, motions[k].result(), frames, size, _settings(size, config), count)
 
 
 def _settings(size: int, config: XPBDConfig) -> str:
@@ -111,41 +121,42 @@ def _settings(size: int, config: XPBDConfig) -> str:
     return json.dumps({"size": size, "edges": "mattes", **dataclasses.asdict(config)})
 
 
-def _ahead(work: Callable[[Take], typing.Any], takes: Sequence[Take]) -> Iterator[typing.Any]:
-    """What `work` makes of each take; that of the next is made in a thread while one is used."""
+def _ahead(items: Iterator[typing.Any]) -> Iterator[typing.Any]:
+    """The items, of which so many are made in a thread while one is used."""
     with ThreadPoolExecutor(1) as thread:
-        coming = None
-        for take in takes:
-            ready, coming = coming, thread.submit(work, take)
-            if ready is not None:
-                yield ready.result()
-        if coming is not None:
-            yield coming.result()
+        coming = collections.deque(thread.submit(next, items, None) for _ in range(_AHEAD))
+        try:
+            while (item := coming.popleft().result()) is not None:
+                coming.append(thread.submit(next, items, None))
+                yield item
+        finally:
+            for one in coming:
+                one.cancel()
 
 
 def _shoot(
     folder: Path,
     avatar: AvatarMesh,
     motion: Motion,
-    vertices: Float[np.ndarray, "f v 3"],
+    frames: Iterator[Float[np.ndarray, "v 3"]],
     size: int,
     settings: str,
-    progress: Callable[[int], object] | None,
+    progress: Callable[[int], object],
 ) -> None:
-    """Draw and write a take that has been simulated."""
+    """Draw and write a take, whose frames are simulated as they are asked for."""
     camera = following_camera(np.asarray(motion.roots), size)
     renderer = MeshRenderer(avatar.faces, avatar.uvs, avatar.texture)
-    shots = []
-    for k, frame in enumerate(vertices):
+    hips = np.asarray(motion.hips)
+    shots, relative = [], []
+    for k, frame in enumerate(frames):
         shots.append(photograph(renderer.pose(frame), jax.tree.map(lambda x, k=k: x[k], camera)))
-        if progress:
-            progress(1)
+        relative.append((frame - hips[k]).astype(np.float16))
+        progress(1)
     new = folder.with_name(f".{folder.name}.new")
     shutil.rmtree(new, ignore_errors=True)
     images, mattes = zip(*shots, strict=True)
     write_monocular(new, list(images), list(mattes), camera, poses_of(avatar.rig, motion))
-    relative = (vertices - np.asarray(motion.hips)[:, None]).astype(np.float16)
-    tree = {"vertices": relative, "faces": avatar.faces, "uvs": avatar.uvs}
+    tree = {"vertices": np.stack(relative), "faces": avatar.faces, "uvs": avatar.uvs}
     weights.save_tree(new / MESHES, tree, film=settings)
     shutil.rmtree(folder, ignore_errors=True)
     new.rename(folder)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import flax.struct
 import jax
@@ -32,8 +32,10 @@ _INTANGIBLE = "Hand"
 # Where along the bones bars lie between the legs, and how thick they are against the leg.
 _BARS = {"UpLeg": (0.3, 0.5, 0.7, 0.9), "Leg": (0.1, 0.35, 0.6, 0.85)}
 _BAR_RADIUS = 0.9
-# Frames: before the first one, and those that one call of a compiled function simulates.
-_DRESSING, _CHUNK = 30, 32
+# Frames that one call of a compiled function simulates; as many, a second, pass before the first one.
+_CHUNK = 30
+# Frames of standing after which all hangs still.
+_SETTLING = 65
 
 
 @typing.no_type_check
@@ -160,18 +162,23 @@ def drive(outfit: Outfit, transforms: Float[Array, "j 3 4"]) -> xpbd.Drive:
     return xpbd.Drive(skinning.skin(outfit.cloth_basis, transforms), Surface(points, normals), capsules)
 
 
-@functools.partial(jax.jit, static_argnames="config")
-def _advance(outfit: Outfit, state: xpbd.ClothState, transforms: Array, config: xpbd.XPBDConfig):
-    drives = jax.vmap(drive, in_axes=(None, 0))(outfit, transforms)
-    return xpbd.simulate(outfit.cloth, state, drives, config)
+_drives = jax.jit(jax.vmap(drive, in_axes=(None, 0)))
+_advance = jax.jit(xpbd.simulate, static_argnames="config")
 
 
-@functools.partial(jax.jit, static_argnames="config")
 def dress(
     outfit: Outfit, transforms: Float[Array, "j 3 4"], velocity: Float[Array, " 3"], config: xpbd.XPBDConfig
 ) -> xpbd.ClothState:
     """The cloth on a body in one pose that moves with a velocity (3,), metres a second: put on in the rest pose, after
     which the body takes the pose within a second while all of it moves along."""
+    return _advance(outfit.cloth, *_put_on(outfit, transforms, velocity, config), config)[0]
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _put_on(
+    outfit: Outfit, transforms: Array, velocity: Array, config: xpbd.XPBDConfig
+) -> tuple[xpbd.ClothState, xpbd.Drive]:
+    """The cloth in the rest pose, and what carries it into the first frame."""
     # The rest pose turned to where the body faces, and set where it stands.
     ahead = transforms[0, :, 2]
     length = jnp.sqrt(ahead[0] ** 2 + ahead[2] ** 2 + 1e-12)
@@ -183,10 +190,10 @@ def dress(
     rest = jnp.broadcast_to(jnp.concatenate([yaw, shift[:, None]], axis=1), transforms.shape)
     begin, end = drive(outfit, rest), drive(outfit, transforms)
 
-    time = jnp.arange(_DRESSING + 1, dtype=jnp.float32)
-    share = jnp.minimum(time / (_DRESSING * 2 / 3), 1)
+    time = jnp.arange(_CHUNK + 1, dtype=jnp.float32)
+    share = jnp.minimum(time / (_CHUNK * 2 / 3), 1)
     share = share * share * (3 - 2 * share)
-    along = velocity[None] * ((time - _DRESSING) / config.fps)[:, None]
+    along = velocity[None] * ((time - _CHUNK) / config.fps)[:, None]
 
     def between(a: Array, b: Array) -> Array:
         s = share.reshape((-1,) + (1,) * a.ndim)
@@ -203,8 +210,7 @@ def dress(
         surface.replace(points=moved(surface.points)),
         capsules.replace(begin=moved(capsules.begin), end=moved(capsules.end)),
     )
-    state = xpbd.ClothState(drives.targets[0], jnp.broadcast_to(velocity, drives.targets[0].shape))
-    return xpbd.simulate(outfit.cloth, state, drives, config)[0]
+    return xpbd.ClothState(drives.targets[0], jnp.broadcast_to(velocity, drives.targets[0].shape)), drives
 
 
 @jax.jit
@@ -222,31 +228,40 @@ def simulate(
 ) -> Float[np.ndarray, "f v 3"]:
     """World vertices (f, v, 3) of an avatar whose bones have the transforms (f, j, 3, 4), 30 frames a second, metres.
 
-    Deterministic. `progress` is called with the number of frames that were finished since the last call. Frames are
-    simulated in chunks of one length, so that all motions share one compiled function.
+    Deterministic. `progress` is called with the number of frames that were finished since the last call.
     """
+    frames = np.empty((len(transforms), len(avatar.vertices), 3), np.float32)
+    done = 0
+    for chunk in chunks(avatar, transforms, config):
+        frames[done : done + len(chunk)] = chunk
+        done += len(chunk)
+        if progress:
+            progress(len(chunk))
+    return frames
+
+
+def chunks(
+    avatar: AvatarMesh, transforms: Float[Array | np.ndarray, "f j 3 4"], config: xpbd.XPBDConfig = xpbd.XPBDConfig()
+) -> Iterator[Float[np.ndarray, "c v 3"]]:
+    """What `simulate` gives, as it is made: the first frame, then some at a time, always as many for the compiler, so
+    that all motions share one program."""
     own = outfit(avatar)
     transforms = jnp.asarray(transforms)
     count = len(transforms)
     hips = transforms[: min(count, 2), 0, :, :3] @ own.hips + transforms[: min(count, 2), 0, :, 3]
     velocity = (hips[-1] - hips[0]) * config.fps * jnp.array([1.0, 0.0, 1.0])
     state = dress(own, transforms[0], velocity, config)
-    frames = np.empty((count, len(avatar.vertices), 3), np.float32)
-    frames[0] = np.asarray(_whole(own, transforms[:1], state.positions[None]))[0]
+    yield np.asarray(_whole(own, transforms[:1], state.positions[None]))
     for start in range(0, count - 1, _CHUNK):
         # The last chunk is filled up with the last frame.
         chunk = transforms[np.minimum(np.arange(start, start + _CHUNK + 1), count - 1)]
-        state, cloth = _advance(own, state, chunk, config)
-        end = min(start + _CHUNK, count - 1)
-        frames[start + 1 : end + 1] = np.asarray(_whole(own, chunk[1:], cloth))[: end - start]
-        if progress:
-            progress(end - start)
-    return frames
+        state, cloth = _advance(own.cloth, state, _drives(own, chunk), config)
+        yield np.asarray(_whole(own, chunk[1:], cloth))[: count - 1 - start]
 
 
 def settle(
     avatar: AvatarMesh, transforms: Float[Array | np.ndarray, "j 3 4"], config: xpbd.XPBDConfig = xpbd.XPBDConfig()
 ) -> Float[np.ndarray, "v 3"]:
     """World vertices (v, 3) of an avatar that has stood still in one pose, transforms (j, 3, 4), for a while."""
-    still = jnp.broadcast_to(jnp.asarray(transforms), (2 * _CHUNK + 1, *np.shape(transforms)))
+    still = jnp.broadcast_to(jnp.asarray(transforms), (_SETTLING, *np.shape(transforms)))
     return simulate(avatar, still, config)[-1]
