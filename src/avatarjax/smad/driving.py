@@ -7,6 +7,7 @@ result. The paper's literal world-frame form diverged on our data.
 
 from __future__ import annotations
 
+import functools
 import typing
 
 import flax.struct
@@ -83,6 +84,7 @@ def features(previous: Pose, pose: Pose, dt: float) -> Float[Array, "f"]:
     )
 
 
+@functools.partial(jax.jit, static_argnames="dt")
 def track(poses: Pose, dt: float) -> Float[Array, "t f"]:
     """`features` of every frame of a motion (t poses); before the first the body is taken to have been at rest."""
     before = jax.tree.map(lambda x: jnp.concatenate([x[:1], x[:-1]]), poses)

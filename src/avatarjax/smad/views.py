@@ -6,6 +6,7 @@ person who turns before one camera is seen from all sides, as a statue would be.
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -16,6 +17,7 @@ from avatarjax.data.recording import MonocularVideo
 from avatarjax.smad import driving
 
 
+@jax.jit
 def body_cameras(camera: Camera, root_rotation: Float[Array, "f 3 3"], root_translation: Float[Array, "f 3"]) -> Camera:
     """The cameras (f,) of all frames in the body frame, from one camera of the world or a batch of f."""
     frames = len(root_rotation)
@@ -32,7 +34,7 @@ def of_video(video: MonocularVideo, frames: Int[np.ndarray, " k"]) -> Camera:
     if camera.world_to_camera.ndim == 3:
         camera = camera.replace(world_to_camera=camera.world_to_camera[frames], intrinsics=camera.intrinsics[frames])
     rotation, translation = video.poses.root_rotation[frames], video.poses.root_translation[frames]
-    return body_cameras(camera, jnp.asarray(rotation), jnp.asarray(translation))
+    return body_cameras(camera, rotation, translation)
 
 
 def spread(frames: int, limit: int) -> Int[np.ndarray, " k"]:
