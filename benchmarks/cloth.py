@@ -1,4 +1,4 @@
-"""Milliseconds a frame of the avatars' cloth on a CPU, and of its constraints alone beside NumPy's, in one run.
+"""Milliseconds a frame of the avatars' cloth on a CPU, and of its parts beside NumPy's and SciPy's, in one run.
 
     python -m benchmarks.cloth                              # UNICA's five
     python -m benchmarks.cloth --avatars monk --repeats 3   # does it work?
@@ -13,6 +13,10 @@ two after the 32 passes, in metres. `Jacobi`: NumPy with all pairs at once, each
 corrections with np.bincount; needs no colours, but a pass brings less: `strain` is the mean relative change of length
 of the pairs after the passes of ours and of Jacobi's, from the same strained start. Ratios are times of ours. XLA may
 use all cores, NumPy's indexing uses one.
+
+Third table: one search for what the cloth may touch, as `find_planes` does twice a frame: the nearest of 512 points on
+each of four groups of limbs, for every vertex, in the first pose of the run. `k-d tree` is SciPy's, built and asked by
+all cores. `further` is by how much our points are further away than its, at most, in per cent.
 """
 
 from __future__ import annotations
@@ -27,12 +31,14 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 import tyro
+from scipy.spatial import cKDTree
 
 from avatarjax.data import avatars, dressing, skinning
 from avatarjax.data.body import Rig
 from avatarjax.data.motion import clips
-from avatarjax.physics import xpbd
+from avatarjax.physics import contacts, xpbd
 from avatarjax.physics.cloth import Cloth
 from avatarjax.physics.contacts import columns
 from benchmarks.timing import seconds
@@ -174,6 +180,25 @@ def constraint_passes(name: str, options: Options) -> str:
     )
 
 
+def contact_search(name: str, options: Options) -> str:
+    """An avatar's row of the third table."""
+    avatar = avatars.build(name)
+    outfit, transforms = dressing.outfit(avatar), running(avatar.rig, 1)[0]
+    cloth = dressing.dress(outfit, transforms, jnp.array([0.0, 0.0, _SPEED]), CONFIG).positions
+    surface = dressing.drive(outfit, transforms).surface
+    queries, groups, ask = np.asarray(cloth), np.asarray(surface.points), jax.jit(contacts.find_planes)
+
+    def tree() -> np.ndarray:
+        return np.stack([cKDTree(points).query(queries, workers=-1)[1] for points in groups])
+
+    ours, peer = (timed(work, options.repeats)[0] for work in (lambda: np.asarray(ask(cloth, surface)), tree))
+    found, best = (
+        np.stack([np.linalg.norm(queries - points[k], axis=1) for points, k in zip(groups, chosen, strict=True)])
+        for chosen in (np.asarray(ask(cloth, surface)), tree())
+    )
+    return f"{name:10s} {ours:8.2f} {peer:9.2f} {peer / ours:6.1f} {100 * (found / best - 1).max():8.3f}"
+
+
 def main(options: Options) -> None:
     """Print the tables."""
     jax.config.update("jax_enable_compilation_cache", False)
@@ -185,6 +210,10 @@ def main(options: Options) -> None:
     print("avatar         ours   colours  ratio    Jacobi  ratio  difference strain: start ours Jacobi")
     for name in options.avatars:
         print(constraint_passes(name, options), flush=True)
+    print("\nthe nearest points of the body, ms (scipy", scipy.__version__ + ")")
+    print("avatar         ours  k-d tree  ratio  further")
+    for name in options.avatars:
+        print(contact_search(name, options), flush=True)
 
 
 if __name__ == "__main__":

@@ -105,7 +105,7 @@ def _blocks(vectors: tuple[Array, ...], size: int) -> tuple[Array, ...]:
 
 def find_planes(positions: Float[Array, "n 3"], surface: Surface) -> Int[Array, "g n"]:
     """The nearest point (g, n) of each group of a surface for each vertex (n, 3)."""
-    return jnp.stack([nearest(positions, points) for points in surface.points])
+    return jax.lax.map(lambda points: nearest(positions, points), surface.points)
 
 
 def take_planes(surface: Surface, planes: Int[Array, "g n"]) -> tuple[Columns, Columns]:
