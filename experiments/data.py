@@ -1,7 +1,7 @@
 """Build an avatar's training data and look at it: clothes simulated over all transitions, pictures, measured quality.
 
     python -m experiments.data --avatar cowgirl                  # preset small: minutes on a laptop
-    python -m experiments.data --avatar monk --preset ci         # under a minute
+    python -m experiments.data --avatar monk --preset ci         # a minute or two
     python -m experiments.data --avatar all --preset paper       # UNICA's 6,253 frames an avatar, 500 poses in 8 views
     python -m experiments.data --avatar cowgirl --performances   # films six motions for SMAD as well
 

@@ -95,8 +95,6 @@ class _Simulated:
         return len(self.scripts[split][k]) + sequences.LEAD_IN
 
     def take(self, split: str, k: int, atlas: posmap.Atlas, advance: Callable[[int], None]) -> tuple[Take, np.ndarray]:
-        # The frame in which the cloth is put on has been simulated when the first chunk is reported.
-        advance(1)
         return sequences.take(self.avatar, atlas, self._motions[split, k], self.scripts[split][k], self.cloth, advance)
 
 
