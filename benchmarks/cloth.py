@@ -81,8 +81,8 @@ def passes(cloth: Cloth) -> Passes:
     @jax.jit
     def solve(x: jax.Array) -> jax.Array:
         once = xpbd._pair_solver(cloth, _DT)
-        x, _ = jax.lax.scan(lambda x, _: (once(x), None), columns(x), length=CONFIG.substeps)
-        return jnp.stack(x, axis=1)
+        passed, _ = jax.lax.scan(lambda x, _: (once(x), None), columns(x), length=CONFIG.substeps)
+        return jnp.stack(passed, axis=1)
 
     masses = np.append(np.asarray(cloth.inverse_masses), np.float32(0))
     ends, weights, lengths = [], [], []

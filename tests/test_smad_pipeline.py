@@ -144,6 +144,10 @@ def test_deformers_are_compared_from_the_same_equilibrium(finished, capsys, monk
         if method == "skinning":
             assert test.mean == pytest.approx(found[method]["PSNR"]["mean"], abs=1e-3)
     assert "pairs of methods" in made.remarks[0]
+    (chosen,) = tables.run_tables(dataclasses.replace(args, methods=("ours",)))
+    assert chosen.rows == made.rows[:1]
+    with pytest.raises(ValueError, match="unknown method 'theirs'"):
+        tables.run_tables(dataclasses.replace(args, methods=("theirs",)))
     checkpoints = finished.parents[2] / "tables" / "ci" / "deformers" / "ghostlady"
     assert {path.parent.name for path in checkpoints.glob("*/swing.safetensors")} == {"ours"}
     monkeypatch.setattr(measures, "EVERY", 1)

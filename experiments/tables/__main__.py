@@ -13,6 +13,7 @@
     python -m experiments.tables monocular --preset ci         # SMAD's Tables 1, 3 and I
     python -m experiments.tables initialisation --preset ci --avatars cowgirl    # SMAD's Fig. 6, right; minutes
     python -m experiments.tables deformers long_takes --preset ci --avatars cowgirl    # SMAD's Tables 2, 4, 5; an hour
+    python -m experiments.tables deformers --preset ci --methods MLP "A1 + losses"         # some of their rows
     python -m experiments.tables fusion --preset ci --avatars cowgirl     # SMAD's feature fusion: five ways, minutes
 
 Runs are those of `python -m experiments.unica --avatar NAME --train` under OUT/unica/NAME/PRESET, and for SMAD's tables
@@ -90,6 +91,8 @@ class Args:
     """Of the runs; default: all that are finished."""
     dynamics: DynamicsName = "coefficients"
     """The model whose sampling steps and context `steps` and `context` vary."""
+    methods: tuple[str, ...] = ()
+    """Rows of `deformers` beside ours, each minutes of training; default: all."""
     rollouts: int = 3
     """Rollouts behind each FVD of `quality`, `alignment` and `steps`."""
     out: Path = Path("runs")
@@ -124,7 +127,7 @@ def run_tables(args: Args) -> list[Table]:
         "strips": lambda: figures.strips(runs, folder),
         "monocular": lambda: monocular.monocular(videos),
         "initialisation": lambda: initialisation.initialisation(films, notebook, folder),
-        "deformers": lambda: deformers.deformers(videos, notebook, folder),
+        "deformers": lambda: deformers.deformers(videos, notebook, folder, args.methods),
         "fusion": lambda: fusion.fusion(videos, notebook, folder),
         "long_takes": lambda: deformers.long_takes(videos, notebook, folder),
     }

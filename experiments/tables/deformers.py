@@ -162,20 +162,25 @@ def visible(gaussians: Gaussians) -> Gaussians:
     return known.replace(logit_opacities=jnp.where(there, known.logit_opacities, -20.0))
 
 
-def deformers(folders: list[Path], notebook: Notebook, folder: Path) -> Table:
-    """SMAD Tables 2 and 4: every method on the run's other takes; checkpoints go below `folder`."""
+def deformers(folders: list[Path], notebook: Notebook, folder: Path, methods: Sequence[str] = ()) -> Table:
+    """SMAD Tables 2 and 4: ours and these methods, by default all, on the run's other takes; checkpoints go below
+    `folder`. Raises ValueError for an unknown method."""
+    unknown = [method for method in methods if method not in METHODS]
+    if unknown:
+        raise ValueError(f"unknown method {unknown[0]!r}: choose of {', '.join(METHODS)}")
+    chosen = [method for method in METHODS if not methods or method in {OURS, *methods}]
     rows: list[list[typing.Any]] = []
     remarks = []
     for run in folders:
         shop = Workshop(run, folder / "deformers" / run.parent.name)
         takes = {part: shop.shown(part) for part in PARTS}
-        works = {method: functools.partial(shop.measured, method, takes) for method in METHODS}
+        works = {method: functools.partial(shop.measured, method, takes) for method in chosen}
         found = {method: notebook.measured(f"{shop.name}, {method}", work) for method, work in works.items()}
-        for method, (_, printed) in METHODS.items():
+        for method in chosen:
             cells = [pooled(found[method][part], "PSNR") for part in PARTS]
             test = found[method]["test"]
             cells += [pooled(test, "LPIPS"), pooled(test, "loose"), less(found[OURS]["test"], test, "PSNR")]
-            rows.append([run.parent.name, method, printed, *cells])
+            rows.append([run.parent.name, method, METHODS[method][1], *cells])
         remarks.append(f"{run.parent.name}: {order({m: f['test'] for m, f in found.items()})}")
     return Table(
         "How the deformer is built (SMAD Tables 2 and 4)",

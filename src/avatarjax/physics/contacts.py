@@ -76,7 +76,7 @@ def nearest(
         sides = zip(low, high, own[:3], strict=True)
         gaps = tuple(jnp.maximum(jnp.maximum(a - c.max(), c.min() - b), 0) for a, b, c in sides)
 
-        def open_(carry: tuple[Array, Array]) -> Array:
+        def promising(carry: tuple[Array, Array]) -> Array:
             left, best = carry
             return left.min() <= best.max()
 
@@ -89,9 +89,9 @@ def nearest(
                 found = jnp.where(dot(offset[3:], offset[3:]) > apart**2, found, none)
             return left.at[k].set(jnp.iinfo(jnp.int32).max), jnp.minimum(best, found.min(axis=0))
 
-        return jax.lax.while_loop(open_, look, (packed(dot(gaps, gaps)), jnp.full(_QUERIES, none)))[1]
+        return jax.lax.while_loop(promising, look, (packed(dot(gaps, gaps)), jnp.full(_QUERIES, none)))[1]
 
-    # One block after the other has no use for what another still looks at; an accelerator is idle meanwhile.
+    # One block after the other: none waits for what another still looks at. An accelerator would be idle meanwhile.
     best = jax.lax.platform_dependent(asked, cpu=lambda x: jax.lax.map(search, x), default=jax.vmap(search))
     return best.reshape(-1)[: queries.shape[0]] & mask
 
