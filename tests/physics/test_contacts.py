@@ -57,6 +57,14 @@ class TestNearest:
         for k in range(3):
             np.testing.assert_array_equal(found[k], contacts.nearest(queries[k], points[k]))
 
+    def test_an_accelerator_finds_the_same(self, monkeypatch):
+        """There all blocks search at once."""
+        rng = np.random.default_rng(1)
+        queries, points = jnp.asarray(cloud(rng, 300)), jnp.asarray(cloud(rng, 90))
+        here = contacts.nearest(queries, points, queries, points, 0.5)
+        monkeypatch.setattr(jax.lax, "platform_dependent", lambda *inputs, cpu, default: default(*inputs))
+        np.testing.assert_array_equal(contacts.nearest(queries, points, queries, points, 0.5), here)
+
     def test_the_first_of_equal_points_wins(self):
         points = jnp.tile(jnp.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), (25, 1))
         found = contacts.nearest(jnp.array([[0.9, 2.0, 3.0], [0.1, 0.0, 0.0]]), points)
