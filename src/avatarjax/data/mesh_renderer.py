@@ -46,8 +46,8 @@ class MeshRenderer:
             raise ValueError(f"need texture coordinates for each of the {len(faces)} triangles, got {len(uvs)}")
         self.faces, self.uvs, self.texture = faces, uvs, texture
         # embreex asks for one index after the other: of a tuple that is twice as fast as of a row of an array.
-        self.corners = np.empty(len(faces), object)
-        self.corners[:] = list(map(tuple, faces.tolist()))
+        self._triples = np.empty(len(faces), object)
+        self._triples[:] = list(map(tuple, faces.tolist()))
         corners = faces.ravel()
         ones = np.ones(len(corners), np.float32)
         triangles = np.repeat(np.arange(len(faces)), 3)
@@ -65,7 +65,7 @@ class MeshRenderer:
         vertices = np.ascontiguousarray(vertices, np.float32)
         if not np.isfinite(vertices).all():
             raise ValueError("the mesh has vertices that are not finite")
-        return PosedMesh(self, vertices, self.vertex_normals(vertices), _scene(vertices, self.corners))
+        return PosedMesh(self, vertices, self.vertex_normals(vertices), _scene(vertices, self._triples))
 
     def render(
         self, vertices: Float[np.ndarray, "v 3"], camera: Camera, supersample: int = 2
@@ -127,12 +127,12 @@ def _rays(vertices: np.ndarray, camera: Camera, supersample: int) -> tuple[np.nd
     return pixels.ravel(), (-rotation.T @ shift).astype(np.float32), directions.reshape(-1, 3)
 
 
-def _scene(vertices: np.ndarray, corners: np.ndarray) -> typing.Any:
+def _scene(vertices: np.ndarray, triples: np.ndarray) -> typing.Any:
     from embreex import rtcore_scene
     from embreex.mesh_construction import TriangleMesh
 
     scene = rtcore_scene.EmbreeScene()
-    TriangleMesh(scene, vertices, corners)
+    TriangleMesh(scene, vertices, triples)
     return scene
 
 
