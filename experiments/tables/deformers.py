@@ -185,10 +185,10 @@ def deformers(folders: list[Path], notebook: Notebook, folder: Path, methods: Se
     return Table(
         "How the deformer is built (SMAD Tables 2 and 4)",
         f"Learned from one video, drawn through rollouts for {LONGER} times the steps of the preset, all from the same "
-        "Gaussians and, but for A0 to A5, the same equilibrium; those have none, as in the paper, and learn from the "
-        "tracks before. Rollouts from rest, one frame of five over black; intervals are over pieces of a second. "
-        "Loose nodes: mean distance in mm to where they truly are. The last column is ours less the method, frame by "
-        "frame. The paper's PSNR is of other subjects.",
+        "Gaussians and the same equilibrium, but that C1 and C3 learn both anew on other nodes, and A0 to A5 have no "
+        "equilibrium, as in the paper, and learn from the tracks before. Rollouts from rest, one frame of five over "
+        "black; intervals are over pieces of a second. Loose nodes: mean distance in mm to where they truly are. The "
+        "last column is ours less the method, frame by frame. The paper's PSNR is of other subjects.",
         [
             "avatar",
             "method",

@@ -23,7 +23,7 @@ def rows(x):
 
 
 class TestNearest:
-    @pytest.mark.parametrize("count", [1, 2, 31, 32, 33, 100, 513])
+    @pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 31, 32, 33, 100, 513])
     @pytest.mark.parametrize("asked", [37, 300])
     def test_no_point_is_nearer(self, asked, count):
         """But for what the index in the lowest bits costs."""
@@ -31,7 +31,7 @@ class TestNearest:
         queries, points = cloud(rng, asked), cloud(rng, count)
         found = np.asarray(contacts.nearest(jnp.asarray(queries), jnp.asarray(points)))
         distances = squares(queries, points)
-        bits = max(1, (-(-count // 32) * 32 - 1).bit_length())
+        bits = max(1, (-(-count // 16) * 16 - 1).bit_length())
         assert found.min() >= 0 and found.max() < count
         assert (distances[np.arange(asked), found] <= distances.min(1) * (1 + 2.0 ** (bits - 22))).all()
 

@@ -60,8 +60,7 @@ def nearest(
     both; squared distances are right to one part in 2^(23 - log2 m).
     """
     count = points.shape[0]
-    bits = max(1, (-(-count // _POINTS) * _POINTS - 1).bit_length())
-    mask = (1 << bits) - 1
+    mask = (1 << max(1, (count - 1).bit_length())) - 1
     none = jnp.int32(jnp.iinfo(jnp.int32).max & ~mask)
     # With a rest pose vectors have six coordinates: in the pose, and in the other one.
     known = rest_queries is not None and rest_points is not None
@@ -84,7 +83,8 @@ def nearest(
             left, best = carry
             k = jnp.argmin(left)
             offset = tuple(q[None] - p[k][:, None] for q, p in zip(own, held, strict=True))
-            found = packed(dot(offset[:3], offset[:3])) | (k * _POINTS + jnp.arange(_POINTS, dtype=jnp.int32))[:, None]
+            index = jnp.minimum(k * _POINTS + jnp.arange(_POINTS, dtype=jnp.int32), count - 1)
+            found = packed(dot(offset[:3], offset[:3])) | index[:, None]
             if known:
                 found = jnp.where(dot(offset[3:], offset[3:]) > apart**2, found, none)
             return left.at[k].set(jnp.iinfo(jnp.int32).max), jnp.minimum(best, found.min(axis=0))
